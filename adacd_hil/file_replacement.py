@@ -142,7 +142,10 @@ def dangling_link(path: Path) -> Path | None:
 
 @contextmanager
 def removing_empty_folders(path: Path) -> Iterator[None]:
-    """When the block ends, remove a folder and its parents as far as they are empty and didn't exist before it."""
+    """When the block ends, remove a folder and its parents as far as they are empty and didn't exist before it.
+
+    If the folder itself is missing then, its parents stay.
+    """
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         yield

@@ -31,7 +31,7 @@ class ValueBound(NamedTuple):
         return self.low <= self.value_in(values) <= self.high
 
     def describe(self, values: Sequence[float]) -> str:
-        """Return the value of a decoded frame and its bounds in words."""
+        """Return the bounded quantity of a decoded frame, as of `value_in`, and its bounds in words."""
         bounds = [f"at least {self.low:g}"] if self.low > -math.inf else []
         bounds += [f"at most {self.high:g}"] if self.high < math.inf else []
         return f"{self.text} {f'{self.value_in(values):g} {self.unit}'.rstrip()}, {' and '.join(bounds)} allowed"

@@ -106,9 +106,10 @@ def write_figures(out_dir: Path, name: str, described: dict[str, Any], drawings:
 
 
 def envelope(y: Vector, bins: int = _ENVELOPE_BINS) -> NDArray[np.int64]:
-    """Return indices of y (k,), ascending: smallest and largest value of each of `bins` equal parts, and both ends.
+    """Return indices of y (k,), ascending: smallest and largest value of each of at most `bins` parts, and both ends.
 
-    A series with at most two values per part is returned whole. NaN is never smallest or largest.
+    The parts are equally long, except the last. A series with at most two values per part is returned whole. NaN is
+    never smallest or largest.
     """
     width = -(-len(y) // bins)
     if width <= 2:

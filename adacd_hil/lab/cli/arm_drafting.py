@@ -80,7 +80,7 @@ class DraftFiles:
     contents: dict[Path, bytes] = field(default_factory=dict)
 
     def require_free(self, path: Path) -> None:
-        """Raise CommandError if a file or link is at the path, unless `--force` is given."""
+        """Raise CommandError if a file, folder or link is at the path, unless `--force` is given."""
         if is_there(path) and not self.is_forced:
             raise CommandError(f"{path} exists; give another name, or --force to replace it", ExitCode.USAGE)
 
@@ -522,7 +522,7 @@ class Drafting:
     def _add_profile(self, text: str, stem: str) -> str:
         """Add the text of a joint's profile to the files to be written; return the file's name, with `stem` in it.
 
-        Equal texts share a file.
+        Equal texts with the same stem share a file. Raises CommandError as `add_file` does.
         """
         files = self._files.setdefault(stem, {})
         name = files.setdefault(text, f"{self.writing.out.stem}-{stem}{f'-{len(files) + 1}' if files else ''}.toml")

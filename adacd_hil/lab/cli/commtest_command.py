@@ -128,7 +128,10 @@ def _run(
 
 
 def _exit_code(test: CommunicationTest, fault: FaultReason, is_interrupted: bool, has_lost_log: bool) -> ExitCode:
-    """Return SAFETY_STOP after a fault, else INTERRUPTED, else FAILURE or OK by the verdict, PARTIAL for a cut log."""
+    """Return SAFETY_STOP after a fault, else INTERRUPTED, else FAILURE for NOT_SUFFICIENT, else PARTIAL or OK.
+
+    PARTIAL if `has_lost_log`: the log lacks data or has no end.
+    """
     if fault is not FaultReason.NONE:
         return ExitCode.SAFETY_STOP
     if is_interrupted:

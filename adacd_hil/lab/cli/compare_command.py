@@ -89,7 +89,10 @@ def _as_text(found: "LogComparison") -> str:
 
 
 def contact_in_words(contact: "Contact | None") -> str:
-    """Return a contact as the text of a table's cell: time, link and, if it is known, force; "–" for None."""
+    """Return a contact as the text of a table's cell: time, link and, if it or a bound is known, force; "–" for None.
+
+    The force of a location that this version doesn't have is written as if known.
+    """
     if contact is None:
         return "–"
     from adacd_hil.records import Location

@@ -67,7 +67,10 @@ def play(
 
 
 def _ending(summary: SessionSummary) -> str:
-    """Return a phrase on how a run ended whose report could not be written: its error, fault or lossy log."""
+    """Return a phrase on why a run, whose report could not be written, didn't end well.
+
+    The phrase names its error, or that no cycle was run; else the fault, the interruption, or the log that lacks data.
+    """
     result = summary.result
     if summary.error or result is None:
         return summary.error or "no cycle was run"

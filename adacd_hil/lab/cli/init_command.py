@@ -121,7 +121,7 @@ def init(
 
 
 def as_text(summary: dict[str, Any]) -> str:
-    """Return a draft's summary as text: written files, warnings, and guesses, a line each."""
+    """Return a draft's summary as text: a line of written files, one per warning, and one of all guesses, if any."""
     lines = [f"written: {', '.join(summary['written'])}"]
     lines += [f"warning: {line}" for line in summary["warnings"]]
     if summary["assumed"]:

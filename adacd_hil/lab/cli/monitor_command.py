@@ -101,9 +101,9 @@ class Monitor:
     def describe(self) -> dict[str, Any]:
         """Return the traffic so far as a dictionary for JSON; its load is of the time since the previous call.
 
-        It has the keys of `BusView.describe`; bus_state, of the controller, read once per `_LINK_S`, "" for other than
-        SocketCAN, "gone" without the interface; and not_processed: frames that the interface carried and this process
-        has not read, None if unknown.
+        It has the keys of `BusView.describe`; bus_state, of the controller, read once per `_LINK_S`, the interface's
+        kind, such as "vcan", if that is unknown, "" for other than SocketCAN, "gone" without the interface; and
+        not_processed: frames that the interface carried and this process has not read, None if unknown.
         """
         now_ns = self._clock.now_ns()
         if self._link_name is not None and now_ns - self._state_ns >= _LINK_S * 1e9:

@@ -375,7 +375,10 @@ def check_rate(patient: ArmExamination) -> Finding:
 
 
 def check_load(patient: ArmExamination) -> Finding:
-    """Warn if the bus load of the stored cycles is above `HIGH_LOAD_PERCENT`, too little room for other frames."""
+    """Warn if the bus load is above `HIGH_LOAD_PERCENT`, too little room for other frames.
+
+    It is the load of the last stored cycles, as of `CommunicationTest.load_percent`.
+    """
     load = patient.communication().load_percent()
     text = f"{load:.1f} % at {patient.bitrate} bit/s"
     if load > HIGH_LOAD_PERCENT:
@@ -457,7 +460,7 @@ def check_saturation(patient: ArmExamination) -> Finding:
 
 
 def _tells_range(sensor: TorqueSensor, devices: Sequence[PlacedDevice]) -> bool:
-    """Return whether a sensor's frames or its profile show that it is saturated. devices: of the arm."""
+    """Return whether a sensor's frames or its profile make a saturation visible. devices: of the arm."""
     frames = (pdo for device in devices if device.name == sensor.name for pdo in device.settings.pdo)
     has_status = any(signal.signal == "status" for pdo in frames for signal in pdo.signals)
     return has_status or sensor.status_in_header is not None or sensor.torque_range_Nm > 0.0
@@ -605,7 +608,8 @@ def _judge_work(work_J: float, text: str) -> Finding:
     """Return the finding on the work ∫ tau_J dq of a joint moved by hand, its drive disabled, zero torque subtracted.
 
     The hand drives the arm, and the arm drives the idle motor through the sensor, so the sensed torque opposes the
-    motion: the work must be negative. text: of the motion.
+    motion: the work must be negative. The check fails above `WORK_FLOOR_J`, warns down to -`WORK_FLOOR_J`, and passes
+    below that. text: of the motion.
     """
     if work_J > WORK_FLOOR_J:
         return failed(

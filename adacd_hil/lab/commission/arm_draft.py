@@ -172,7 +172,7 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = (), pitch_deg: float
 
 
 def _angle_deg(start: Vector, end: Vector, axis: Vector) -> float:
-    """Return the angle about `axis` from direction `start` to `end`, deg in [-180, 180]."""
+    """Return the angle about the unit vector `axis` from `start`, which is across it, to `end`, deg in [-180, 180]."""
     return math.degrees(math.atan2(float(np.cross(start, end) @ axis), float(start @ end)))
 
 
@@ -541,8 +541,8 @@ def _fast_damping(Kd: Vector, cad_theta: Sequence[float]) -> Iterator[str]:
 def _rest_torque(facts: ArmFacts) -> Entry:
     """Return `safety.rest_torque_Nm` for an arm with gravity, whose load may rest on the sensors.
 
-    It is the default plus gravity's largest torque on joint 1 and a fifth, at most `_MOST_REST_NM`. If the masses are
-    not known, it is the default plus the larger torque limit, as a guess.
+    It is the default plus 1.2 times gravity's largest torque on joint 1. If the masses are not known, it is the default
+    plus the larger torque limit, as a guess. Either sum is at most `_MOST_REST_NM`.
     """
     free = load_settings("certified").safety.rest_torque_Nm
     gravity = _gravity(facts, facts.position_limit_deg.value)[0]

@@ -63,7 +63,10 @@ class ZeroTorqueLoop:
         self._max_age_cycles = settings.bus.max_age_cycles
 
     def interrupt(self) -> None:
-        """Make `run` end after the present cycle, and every later `run` before its first. Safe in a signal handler."""
+        """Make `run` after the present cycle, and every later `run` at once, disable the drives and end.
+
+        Safe in a signal handler.
+        """
         self.is_interrupted = True
 
     def run(
@@ -148,8 +151,8 @@ class CommunicationTest:
     """Collects the cycles of a test, by `observe_cycle`, and judges them.
 
     Bitrate, data_bitrate: bit/s, 0 without CAN FD. is_enabling: whether the drives shall be enabled. complete: number
-    of cycles with complete fresh data. overruns: number of skipped periods. enabled: number of cycles with both drives
-    enabled.
+    of cycles with complete fresh data. overruns: number of periods skipped after the first cycle. enabled: number of
+    cycles with both drives enabled.
     """
 
     settings: Settings
@@ -191,7 +194,7 @@ class CommunicationTest:
 
     @property
     def periods(self) -> int:
-        """Number of periods, skipped ones included."""
+        """Number of periods, including those skipped after the first cycle."""
         return self.cycles + self.overruns
 
     @property

@@ -75,9 +75,9 @@ def function_name(can_id: int) -> str:
 class Node:
     """One CANopen node. None: unknown, since it didn't answer or has no such object.
 
-    nmt_state: 0, 4, 5 or 127, of its last heartbeat or boot-up. has_pdos: it sent TPDOs. answers: it answered every SDO
-    request. emergencies: (error code, error register), oldest first. produces: identifiers that it sent, but SDO
-    responses.
+    nmt_state: of its last heartbeat or boot-up, by CiA 301 one of 0, 4, 5 and 127. has_pdos: it sent TPDOs. answers: it
+    answered every SDO request. emergencies: (error code, error register), oldest first. produces: identifiers that it
+    sent, but SDO responses.
     """
 
     node_id: int

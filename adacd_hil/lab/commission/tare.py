@@ -230,7 +230,8 @@ def _solve(poses: Sequence[Pose], settings: Settings) -> TareSolution:
 def _errors_of_unknowns(matrix: NDArray[np.float64], poses: Sequence[Pose], residual: Vector) -> Vector:
     """Return the standard error of each unknown, one per column of the matrix of equations (2 N, unknowns).
 
-    An equation's error is the larger of two: the noise of its mean, and the disagreement of the poses.
+    An equation's error is the noise of its mean, or the disagreement of the poses, if that is larger. The disagreement
+    counts only with more equations than unknowns.
     """
     inverse = np.linalg.inv(matrix.T @ matrix)
     variance = np.array([pose.standard_error_Nm for pose in poses]) ** 2

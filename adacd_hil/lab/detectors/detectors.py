@@ -328,8 +328,8 @@ def make_stream(
 def likelihood_weights(z: Vector, lag_s: float, period_s: float) -> Vector:
     """Return the likelihood weights (n, N, L) of all joints, from a contact-free stream z (n_samples, n), Nm.
 
-    lag_s: as of `likelihood_windows`. L is the largest age of `ONSET_SAMPLES` plus 16. Raises ValueError if z has fewer
-    than 10 L samples, or a joint's variance is 0.
+    lag_s: as of `likelihood_windows`. N is the number of `ONSET_SAMPLES`, L the largest of them plus 16. Raises
+    ValueError if z has fewer than 10 L samples, or a joint's variance is 0.
     """
     length = max(ONSET_SAMPLES) + 16
     return np.array(

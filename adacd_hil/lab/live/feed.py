@@ -149,7 +149,7 @@ class LiveFeed:
     def is_watched(self) -> bool:
         """Whether a viewer has subscribed to a topic, by the latest word of the view's process, which is read here.
 
-        False once that process has closed its socket.
+        False once that process has closed its socket; if the socket is reset, only from the second call on.
         """
         with contextlib.suppress(BlockingIOError, ConnectionResetError):
             while word := self._socket.recv(processes.MOST_BYTES):

@@ -60,7 +60,7 @@ class McapWriter(BinaryIOMessageWriter):
     def __init__(self, file: Any, append: bool = False, **_: Any) -> None:
         """Create a file, or write to an open binary one.
 
-        Raises ValueError for `append`, FileExistsError for a file that isn't empty.
+        Raises ValueError for `append`, FileExistsError for the path of a file that isn't empty.
         """
         if append:
             raise ValueError("nothing can be appended to an MCAP file; log to another one")

@@ -63,7 +63,10 @@ class Losses:
 
     @property
     def is_any(self) -> bool:
-        """Whether anything is lost or may be wrong; a gap in time alone is no loss."""
+        """Whether anything is lost, or metadata may be wrong.
+
+        A gap in time alone is no loss, nor are messages that no CRC vouches for.
+        """
         return bool(self.describe())
 
     def describe(self) -> str:
@@ -258,9 +261,9 @@ class Salvage:
             self._is_explained |= body[6:] != entries[is_own].tobytes()
 
     def _doubt(self, file: IO[bytes]) -> None:
-        """Mark the losses as doubtful if the CRC of the data section fails though no damage was found.
+        """Mark the losses as doubtful, and add a note, if the data section has a CRC and fails it.
 
-        Then metadata may be wrong.
+        Then metadata may be wrong. Call it only if no damage was found that explains the failure.
         """
         stored = int.from_bytes(self._data_end.body, "little")
         if stored and stored != crc_of(file, 0, self._data_end.offset):

@@ -270,7 +270,10 @@ def _below_units(
 
 
 def _read_unusual_row(cells: list[str], wanted: list[_Column]) -> tuple[list[float], list[tuple[_Column, str]]]:
-    """Return the numbers of a row, nan for empty cells, and the columns and texts of cells that are no numbers."""
+    """Return the numbers of a row, nan for empty cells, and the columns and texts of cells that are no numbers.
+
+    These cells are missing from the numbers.
+    """
     row, wrong = [], []
     for column in wanted:
         text = cells[column.place].strip()

@@ -53,7 +53,8 @@ def draft_map(recording: Path, urdf: Path, map_path: Path) -> list[DraftedKey]:
     """Return the keys of a map of a recording, for `map_text`; write no file.
 
     map_path: file in which the caller will save the map; the URDF's path is relative to its folder. Raises ConfigError
-    if the URDF can't be read, or no columns or joints of the recording fit it; LogError if the recording can't be read.
+    if the URDF can't be read, or no columns or joints of the recording fit it; LogError if the recording can't be read,
+    or has no joint states or no rows of numbers.
     """
     arm, locked = _read_arm(urdf)
     where = Path(os.path.relpath(urdf.resolve(), map_path.resolve().parent)).as_posix()
@@ -172,9 +173,9 @@ def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
 
 
 def _torque_unit(tau: Vector, arm: SerialArm) -> tuple[str, str]:
-    """Return "mNm" and the reason if a torque is over `_BEYOND_EFFORT` times the URDF's effort, else "Nm", "".
+    """Return "mNm" and the reason if a joint's torque is over `_BEYOND_EFFORT` times the URDF's effort, else "Nm", "".
 
-    tau (k, n).
+    Its 99 % quantile counts. Without an effort the torque is over nothing. tau (k, n).
     """
     largest, effort = torques_and_limits(tau, arm)
     over = np.nan_to_num(largest / effort)

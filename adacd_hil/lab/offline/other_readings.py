@@ -249,7 +249,10 @@ def _judge(
 
 
 def _other_units(described: RecordingMap, tested: list[Record]) -> Iterator[tuple[int, float]]:
-    """Yield (joint, factor), factors 0.001 and 1000, that leave all torques within `BEYOND_EFFORT` times the effort."""
+    """Yield (joint, factor), factors 0.001 and 1000, that leave all torques within `BEYOND_EFFORT` times the effort.
+
+    The 99 % quantile of each joint's torque counts; a joint without an effort in the URDF is always within.
+    """
     largest, effort = torques_and_limits(np.concatenate([record.tau_J for record in tested]), described.urdf)
     for joint, factor in itertools.product(range(described.joints), (1e-3, 1e3)):
         scaled = np.where(np.arange(described.joints) == joint, factor * largest, largest)
@@ -348,7 +351,7 @@ def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
 
 
 def _late(described: RecordingMap, model: ArmModel, period_s: float) -> Iterator[_Motion]:
-    """Yield interpretations with one or all positions, or torques, late by `_LATE` samples."""
+    """Yield interpretations with one or all positions, or torques, late by each number of samples in `_LATE`."""
     n, names = model.joints, described.urdf.joint_names
     for samples, (first, what) in itertools.product(_LATE, ((0, "position"), (n, "torque"))):
         for joints in [*((i,) for i in range(n)), *([tuple(range(n))] if n > 1 else [])]:

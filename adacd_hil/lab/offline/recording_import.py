@@ -311,7 +311,8 @@ def derivative_window(described: RecordingMap, period_s: float) -> int:
 def derive(q: Vector, period_s: float, window: int) -> Vector:
     """Derive velocities (k, n) from positions, without delay: the slope of a cubic over `window` samples.
 
-    The velocity of a joint at rest is exactly 0. Raises ValueError if k is below `window`.
+    The velocity of a joint that never leaves its first position is exactly 0. window: as of `derivative_window`. Raises
+    ValueError if k is below `window`.
     """
     travel = q - q[0]  # of a constant position, rounding leaves a velocity with a sign
     return np.asarray(savgol_filter(travel, window, _DEGREE, deriv=1, delta=period_s, axis=0), np.float64)
