@@ -18,6 +18,8 @@ LOST_KEY = "lost"
 """Of the summary of a recovered log: its losses in words; missing without any."""
 DROPPED_KEY = "dropped"
 """Of the summary: packets that are not in the log."""
+MOST_DIGITS = 18
+"""Of a number in a log's texts; Python refuses to read more than 4300."""
 
 
 def log_in(given: str | Path) -> Path:
@@ -54,7 +56,11 @@ def missing_parts(path: Path, parts: Collection[int], ending: str = "") -> list[
     return [part_path(path, number) for number in missing]
 
 
+def whole_number(text: str) -> int | None:
+    """Return the number that a text is, of at most MOST_DIGITS digits; None for another text, as of a damaged log."""
+    return int(text) if text.isdecimal() and len(text) <= MOST_DIGITS else None
+
+
 def summary_count(texts: Mapping[str, str], key: str) -> int:
-    """Return the count under a key in a log's summary; 0 if it is missing or not a number."""
-    text = texts.get(key, "0")
-    return int(text) if text.isdecimal() else 0
+    """Return the count under a key in a log's summary; 0 if it is missing or not a number, see `whole_number`."""
+    return whole_number(texts.get(key, "")) or 0

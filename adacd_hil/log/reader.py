@@ -28,7 +28,7 @@ from adacd_hil.log.log_files import (
     LogError,
     part_path,
 )
-from adacd_hil.log.log_parts import DROPPED_KEY, LOST_KEY, log_in, parts_of, summary_count
+from adacd_hil.log.log_parts import DROPPED_KEY, LOST_KEY, log_in, parts_of, summary_count, whole_number
 from adacd_hil.log.log_walk import Extras, PartWalk, read_head
 from adacd_hil.log.mcap.record_layout import record_dtype
 from adacd_hil.log.types.message_types import (
@@ -304,7 +304,8 @@ class LogStream:
             return
         if said != str(number):
             self._plan.append(f"{path.name} is part {said} of a log")
-            number = int(said) if said.isdecimal() else number
+            told = whole_number(said)
+            number = number if told is None else told
         self._plan.append((path, number))
         self.metadata = self.metadata or metadata
         self.attachments = {**head.attachments, **self.attachments}

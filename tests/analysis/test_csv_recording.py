@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from foreign_arms import urdf_text
 
-from adacd_hil.lab.offline.recording_import import ForeignRecording, read_recording
+from adacd_hil.lab.offline.recording_import import ForeignRecording, derive, read_recording
 from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.log.log_files import LogError
 from adacd_hil.settings.schema import ConfigError
@@ -269,3 +269,11 @@ def test_times_that_jitter_are_a_note_with_the_period_that_replaces_them(read):
 def test_noise_is_at_least_that_of_rounding(read):
     recording = read(table(lambda k, q, tau: f"{0.005 * k:.3f},{q},{round(tau / 0.5) * 0.5}"))
     assert recording.noise_Nm[0] == pytest.approx(0.5 / np.sqrt(12.0))
+
+
+def test_a_joint_that_comes_to_rest_has_no_velocity_there():
+    """Not even the rounding's, whose sign would be friction's."""
+    q = np.outer(np.minimum(np.arange(60) / 200.0, 0.1), [1.0, -1e-3])
+    dq = derive(q, 0.001, 11)
+    assert np.all(dq[:15] != 0.0)
+    assert np.all(dq[26:] == 0.0)

@@ -11,6 +11,7 @@ from adacd_hil.lab.logs.python_can_files import to_messages
 from adacd_hil.lab.logs.signal_tables import Tables, export_tables
 from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LogError, find_parts
+from adacd_hil.log.log_parts import summary_count
 from adacd_hil.log.mcap.chunks import MOST_BYTES
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.message_types import TIME_TEXT, payload_dtype
@@ -132,3 +133,10 @@ def test_a_part_with_a_number_that_no_run_reaches_is_none(tmp_path):
     for name in ("run.mcap", "run_001.mcap", "run_9999999999.mcap"):
         (tmp_path / name).write_bytes(make_log())
     assert list(find_parts(tmp_path / "run.mcap")) == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("text", "count"), [("9" * 18, 10**18 - 1), ("9" * 19, 0), ("9" * 5000, 0), ("-1", 0), ("", 0)]
+)
+def test_a_count_of_a_damaged_summary_is_0(text: str, count: int) -> None:
+    assert summary_count({"frames": text}, "frames") == count

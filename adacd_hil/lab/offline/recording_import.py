@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.signal import savgol_filter
 
 from adacd_hil.lab.logs.joint_state_bags import is_bag
@@ -311,11 +312,12 @@ def derivative_window(described: RecordingMap, period_s: float) -> int:
 def derive(q: Vector, period_s: float, window: int) -> Vector:
     """Derive velocities (k, n) from positions, without delay: the slope of a cubic over `window` samples.
 
-    The velocity of a joint that never leaves its first position is exactly 0. window: as of `derivative_window`. Raises
-    ValueError if k is below `window`.
+    It is exactly 0 where the position is constant in the window. window: as of `derivative_window`. Raises ValueError
+    if k is below `window`.
     """
-    travel = q - q[0]  # of a constant position, rounding leaves a velocity with a sign
-    return np.asarray(savgol_filter(travel, window, _DEGREE, deriv=1, delta=period_s, axis=0), np.float64)
+    dq = np.asarray(savgol_filter(q - q[0], window, _DEGREE, deriv=1, delta=period_s, axis=0), np.float64)
+    dq[maximum_filter1d(q, window, axis=0) == minimum_filter1d(q, window, axis=0)] = 0.0  # rounding leaves a sign
+    return dq
 
 
 def _noise(parts: list[Vector], given: Vector) -> list[float]:

@@ -55,7 +55,7 @@ from adacd_hil.lab.score.run_arrays import (
 )
 from adacd_hil.lab.score.run_judge import find_detections, timed_contacts, uncovered_watch
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, DBC_NAME, ENDING_KEY, TRUTH_NAME, LogError
-from adacd_hil.log.log_parts import CUT, PLANNED_ENDINGS
+from adacd_hil.log.log_parts import CUT, PLANNED_ENDINGS, whole_number
 from adacd_hil.log.logged_run import Cycles, Mask, Milestones, Progress, host_cycles, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series, contacts_of, start_of_log
 from adacd_hil.log.time_window import WHOLE, TimeWindow
@@ -85,7 +85,6 @@ _WAITING: Final = 50_000
 """Cycles that are gathered at a time."""
 _BEYOND_S: Final = 1.0
 """How much longer than the settling time cycles wait: longer than two kept rows of a truth lie apart."""
-_MOST_DIGITS: Final = 18
 
 Bounds = tuple[int, int]
 """From when, and before when, ns of the run's clock."""
@@ -242,17 +241,9 @@ def _with_ending(
         of_truth = "; ".join(filter(None, (of_truth, " ".join(words))))
     source = ReportSource(stream.path.name, log_problem, is_complete, of_truth)
     if run.stretch is None:
-        run = replace(run, frames=_count(stream.summary, "frames"), dropped=_count(stream.summary, "dropped"))
+        frames, dropped = (whole_number(stream.summary.get(key, "")) for key in ("frames", "dropped"))
+        run = replace(run, frames=frames, dropped=dropped)
     return ReadRun(run, gathered, source)
-
-
-def _count(summary: Mapping[str, str], key: str) -> int | None:
-    """Return a number of the log's summary.
-
-    None if it is missing, as in a cut file, or no number of up to `_MOST_DIGITS` digits, as in a damaged one.
-    """
-    text = summary.get(key, "")
-    return int(text) if text.isdecimal() and len(text) <= _MOST_DIGITS else None
 
 
 class RunReading:

@@ -43,7 +43,7 @@ CERTIFIED, IDENTIFIED, TAKEN_BACK, NO_CERTIFICATE = "certified", "identified", "
 """States of a certificate. `identified`: by the paper's scheme, which issues no certificates."""
 _MOST_REPORT_BYTES: Final = 64 << 20
 _DATED: Final = re.compile(r"(\d{4}-\d\d-\d\d)[T_ ](\d\d)[-:]?(\d\d)[-:]?(\d\d)")
-_IDENTITY: Final = re.compile(r"node \d+: (vendor \S+, product \S+), revision \S+, serial (\d+)")
+_IDENTITY: Final = re.compile(r"node \d+: (vendor \S+, product \S+), revision \S+, serial (\d{1,18})")
 """The event of a device that was identified."""
 _MOTION_START: Final = "-> ADAPT"
 _TO_MONITOR: Final = ("ADAPT -> MONITOR", "CERTIFY -> MONITOR")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import EPOCH_KEY, RUN_METADATA, LogError, failing_as
-from adacd_hil.log.log_parts import parts_of
+from adacd_hil.log.log_parts import parts_of, summary_count
 from adacd_hil.log.mcap.chunks import Block, Contents, read_blocks
 from adacd_hil.log.mcap.mcap_records import DEFINITIONS, Definitions, Problem, RawRecord, check_magic, parse, summary_of
 from adacd_hil.log.mcap.record_layout import HEAD, MAGIC, MESSAGE_HEAD, record_dtype
@@ -143,8 +143,7 @@ class McapFrames:
             metadata: Metadata = parse(item.opcode, item.body)
             if metadata.name == RUN_METADATA:
                 self._bus = metadata.metadata.get("channel", "")
-                epoch_ns = metadata.metadata.get(EPOCH_KEY, "")
-                self.epoch_ns = int(epoch_ns) if epoch_ns.isdecimal() else 0
+                self.epoch_ns = summary_count(metadata.metadata, EPOCH_KEY)
         return _NO_FRAMES
 
     def _define(self, record: RawRecord) -> None:
