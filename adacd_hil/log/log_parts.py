@@ -18,8 +18,7 @@ LOST_KEY = "lost"
 """Of the summary of a recovered log: its losses in words; missing without any."""
 DROPPED_KEY = "dropped"
 """Of the summary: packets that are not in the log."""
-MOST_DIGITS = 18
-"""Of a number in a log's texts; Python refuses to read more than 4300."""
+_MOST_DIGITS = 19  # of 63 bits; Python refuses to read more than 4300
 
 
 def log_in(given: str | Path) -> Path:
@@ -57,8 +56,9 @@ def missing_parts(path: Path, parts: Collection[int], ending: str = "") -> list[
 
 
 def whole_number(text: str) -> int | None:
-    """Return the number that a text is, of at most MOST_DIGITS digits; None for another text, as of a damaged log."""
-    return int(text) if text.isdecimal() and len(text) <= MOST_DIGITS else None
+    """Return the number that a text is, of at most 63 bits; None for another text, as of a damaged log."""
+    is_number = text.isdecimal() and len(text) <= _MOST_DIGITS and int(text) < 1 << 63
+    return int(text) if is_number else None
 
 
 def summary_count(texts: Mapping[str, str], key: str) -> int:
