@@ -31,7 +31,9 @@ MOST_FILLED = 8
 def follow_lost(k: Constants, m: Memory, dq: Vector, steps: int, period_s: float, is_seen: bool) -> None:
     """Update `lost_Nm2` (C, n), the variance by missing samples, by a sample that came `steps` periods after the last.
 
-    period_s: time since the last sample. is_seen: the missing samples were interpolated; False: that time was cut out.
+    It decays; filled gaps (steps above 1) add noise and the line's error, with friction for a joint that has turned; a
+    cut adds the velocity's noise. dq (n,): of this sample; `m.gaps.last` must still hold the sample before. period_s:
+    time since it. is_seen: the missing samples were interpolated; False: that time was cut out.
     """
     lost, before = m.lost.lost_Nm2, m.gaps.last[1]
     for c in range(lost.shape[0]):
