@@ -38,7 +38,7 @@ _RESTRICTED = (
 
 
 def _is_restricted(can_id: int) -> bool:
-    """Return whether CiA 301, table 34, or SYNC and EMCY forbid an identifier to PDOs."""
+    """Return whether CiA 301, table 34, or SYNC, EMCY or TIME forbid an identifier to PDOs."""
     return any(low <= can_id <= high for low, high in _RESTRICTED)
 
 

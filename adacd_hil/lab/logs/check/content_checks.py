@@ -71,8 +71,9 @@ class DefinitionCheck:
         """Check a channel by the rules and against the data section's first one of its number; add findings.
 
         Its schema must be defined before. Stores in `channels` the data section's first channel of each number, in
-        `all_channels` the data section's last one, or the summary's first one if that has none. offset: of its record
-        or chunk in the file. is_summary: it stands in the summary.
+        `all_channels` the data section's last one, or the summary's first one if that has none, and in
+        `summary_channels` the summary's numbers; notes for `finish` those that only the summary has. offset: of its
+        record or chunk in the file. is_summary: it stands in the summary.
         """
         name = f"channel {channel.id}"
         known = self.channels.get(channel.id)
