@@ -272,8 +272,8 @@ def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
     """Return a device's description: its EDS, and the values at power-on that profile, settings or standard add to it.
 
     Added to each EDS are the objects that it omits (`made_up`) and live values behind the profile's objects
-    (`aliases`). An EDS of the package keeps its values except the serial number. Raises ConfigError for an EDS with a wrong type or
-    an unsigned signal.
+    (`aliases`). An EDS of the package keeps its values except the serial number. Raises ConfigError for an EDS with a
+    wrong type or an unsigned signal.
     """
     _check_objects(device)
     kind, scale = device.settings.kind, device.settings.scale

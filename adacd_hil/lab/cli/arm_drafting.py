@@ -716,7 +716,8 @@ class Drafting:
         """Return the rated torque at both joints, Nm, and its source: the option or user, drives, or their EDS.
 
         0x6076 of drives or EDS is taken only if no guess went into it; else it is a proposal, as is the effort of
-        `geometry`. `--yes` or Enter takes the proposal, else the default, as a guess with the source "". Raises ConfigError for a wrong value, CommandError without an answer.
+        `geometry`. `--yes` or Enter takes the proposal, else the default, as a guess with the source "". Raises
+        ConfigError for a wrong value, CommandError without an answer.
         """
         scales = [profile.scale for profile in profiles]
         drafts = [draft for joint in range(2) if (draft := self._drafts.get((DRIVE, joint))) is not None]

@@ -24,8 +24,8 @@ def classify(tau_ext_wide_hat: Vector, sigma: Vector, period_s: float) -> Contac
     """Return PUSH if the mean torque of the last END_S is at least LEFT times the largest torque, else HIT.
 
     HIT also without any torque. A torque is the root of the sum of the joints' squares, each in units of its standard
-    deviation; the mean is that of each joint's signed torque. tau_ext_wide_hat: external torque (n, 2), Nm, with the filter undone, from the contact's beginning to the
-    end of its window; sigma: its standard deviation (2,), Nm.
+    deviation; the mean is that of each joint's signed torque. tau_ext_wide_hat: external torque (n, 2), Nm, with the
+    filter undone, from the contact's beginning to the end of its window; sigma: its standard deviation (2,), Nm.
     """
     torques = tau_ext_wide_hat / sigma
     left = np.hypot(*np.mean(torques[-max(1, round(END_S / period_s)) :], axis=0))

@@ -149,7 +149,8 @@ def is_no_more(k: Constants, m: Memory) -> bool:
 
     Call `evidence.fit` before. Store the comparisons as evidence. Drop a kept belief that comes from a lean, see
     `_is_leant_on`. Count a fit that contradicts the others only by little, or has less friction and no more else; if
-    enough such fits in a row agree, drop all kept beliefs, set `has_lapsed` and return True, see `_lapses`. True also without kept beliefs.
+    enough such fits in a row agree, drop all kept beliefs, set `has_lapsed` and return True, see `_lapses`. True also
+    without kept beliefs.
     """
     is_no_more = True
     for s in range(KEPT, KEPT + int(m.earlier.kept_count)):
