@@ -338,7 +338,7 @@ a contact after a collision is not latched by it | STOPPED | acknowledge, contac
 a fit is tested and a refuted one is learnt on | CERTIFY | adapted+fitted = CERTIFY, refuted+certified = ADAPT, fitted, certified = MONITOR
 a test and the learning before it share one time limit | ADAPT | good*500, fitted, good*300, refuted, good*197 = ADAPT, good = FAULT
 a contact stops the clock of the adaptation and does not set it back | ADAPT | good*600, contact, rest*200, good*398 = ADAPT, good = FAULT
-an adaptation after a payload has its own time | ADAPT | good*900, adapted, payload, rest*50, rest+payload_changed = ADAPT, good*999 = ADAPT
+an adaptation after a payload has its own time | ADAPT | good*900, adapted, payload, rest*50, rest+payload_changed = ADAPT, good*999 = ADAPT, good = FAULT
 hands that change the payload do not make the arm forget it: a contact | PAYLOAD | contact, payload_changed, rest*200, rest+acknowledge, rest*2 = ADAPT
 hands that change the payload do not make the arm forget it: a collision | PAYLOAD | collision, payload_changed, rest*200, rest+acknowledge, rest*2 = ADAPT
 a blow may throw the arm faster than its limit for a moment | MONITOR | collision, collision+over-speed*100 = REACT, over-speed = FAULT
