@@ -24,7 +24,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import boxcox, inv_boxcox
 
 from adacd_hil.lab.score.rates import CONFIDENCE
@@ -125,17 +124,14 @@ def threshold_by_count(peaks: Vector, alarms: float) -> float:
     Of the levels before the first with more alarms it is the lowest with the most. Below those, alarms merge into few
     long ones, down to a single one at the smallest block. NaN blocks don't count.
     """
-    values = np.where(np.isnan(peaks), -np.inf, peaks)
-    near = round(CLUSTER_S / BLOCK_S)
-    before = sliding_window_view(np.r_[np.full(near, -np.inf), values[:-1]], near).max(axis=1)
-    levels = np.unique(peaks[~np.isnan(peaks)])[::-1]
-    # an alarm begins at a block above the level without another one just before it
-    above, begun = (
-        values.size - np.searchsorted(np.sort(each), levels, "right") for each in (values, np.minimum(values, before))
-    )
-    counts = above - begun
-    is_allowed = np.logical_and.accumulate(counts <= alarms)
-    return float(levels[is_allowed & (counts == counts[is_allowed].max())][-1])
+    found, most = float(np.nanmax(peaks)), 0
+    for level in np.unique(peaks[~np.isnan(peaks)])[::-1]:
+        count = clusters(peaks, level).size
+        if count > alarms:
+            break
+        if count >= most:
+            found, most = float(level), count
+    return found
 
 
 def fit_tail(peaks: Vector) -> Tail:
