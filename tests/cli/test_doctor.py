@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from called import called
 from commission.tare_rig import HandledRig
+from loaded import encoded
 from own_arm import describe_arm, describe_geared_arm
 from rig import CODEC, Rig
 
@@ -238,12 +239,12 @@ def saturated(cycle: int, can_id: int, data: bytes) -> bytes:
 
 def moving(cycle: int, can_id: int, data: bytes) -> bytes:
     message = CODEC.message("Drive1Feedback")
-    return bytes(message.encode(message.decode_values(data)[0], 0.2)) if can_id == message.can_id else data
+    return bytes(encoded(message, message.decode_values(data)[0], 0.2)) if can_id == message.can_id else data
 
 
 def creeping(cycle: int, can_id: int, data: bytes) -> bytes:
     message = CODEC.message("Drive2Feedback")
-    return bytes(message.encode(message.decode_values(data)[0] + 1e-4 * cycle, 0.0)) if can_id == 0x182 else data
+    return bytes(encoded(message, message.decode_values(data)[0] + 1e-4 * cycle, 0.0)) if can_id == 0x182 else data
 
 
 def without_heartbeat(cycle: int, can_id: int, data: bytes) -> bytes | None:
