@@ -313,6 +313,18 @@ def test_a_joint_moved_by_hand_tells_its_order_and_signs(speed_rad_s, torque_Nm,
     assert text in finding.reason
 
 
+def test_who_interrupts_learns_that_nodes_were_not_stopped(monkeypatch):
+    def interrupt(_: ArmExamination) -> Finding:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ArmExamination, "leave", lambda _: "lab is gone")
+    monkeypatch.setattr("adacd_hil.lab.cli.doctor_command.HOST_CHECKS", ())
+    monkeypatch.setattr("adacd_hil.lab.cli.doctor_command.ARM_CHECKS", [Check("nodes", interrupt)])
+    interrupted = called("doctor", "-i", "virtual", "-c", "lab")
+    assert interrupted.exit_code == 130
+    assert "nodes were not stopped: lab is gone; cut the drives' power" in interrupted.stderr
+
+
 def test_a_check_whose_prerequisite_failed_is_skipped_with_the_reason_behind_it():
     checks = [
         Check("a", lambda _: failed("broken", "mend it")),
