@@ -117,6 +117,14 @@ def test_semicolons_decimal_commas_and_lines_above_the_head_are_found(tmp_path, 
     assert keys["units"] == {"q": "deg"}
 
 
+def test_heads_that_numpy_savetxt_writes_as_a_comment_are_found(tmp_path, motion):
+    text = table("# t q1 q2 tau1 tau2\n# s deg deg Nm Nm", motion.t, motion.q, motion.tau, delimiter=" ")
+    _, keys = draft(tmp_path, text)
+    assert keys["csv"] == {"delimiter": " "}
+    assert keys["columns"] == {"time": "t", "q": ["q1", "q2"], "tau_J": ["tau1", "tau2"]}
+    assert keys["units"] == {"q": "deg"}
+
+
 def test_dates_are_found_and_tell_the_interval_of_the_rows(tmp_path, motion):
     rows = table("", motion.q, np.degrees(motion.dq), motion.tau).splitlines()
     dated = [f"2024-05-01T10:00:{0.005 * k:09.6f}Z,{row}" for k, row in enumerate(rows)]

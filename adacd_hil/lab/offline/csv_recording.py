@@ -139,9 +139,12 @@ def opened_text(path: Path) -> Iterator[TextIO]:
 
 
 def split_rows(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
-    """Yield the cells of each line; a delimiter " " is any white space. Raises LogError, with `path`, for bad CSV."""
+    """Yield the cells of each line; a delimiter " " is any white space, but none behind a "#" that begins the line.
+
+    Raises LogError, with `path`, for bad CSV.
+    """
     if delimiter == " ":
-        yield from (line.split() for line in lines)
+        yield from (re.sub(r"^\s*#\s+", "#", line).split() for line in lines)
         return
     rows = csv.reader(lines, delimiter=delimiter)
     try:
