@@ -87,20 +87,29 @@ def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
 
 
 def _head(path: Path, first: list[str], described: RecordingMap) -> list[str]:
-    """Return the stripped cells of the first row, without empty ones at its end and without a "#" at its begin.
+    """Return the cells of the first row as of `head_of`.
 
     Raises ConfigError if the map says that there is a header, its delimiter gives one column, and another one over two.
     """
-    while first and not first[-1].strip():  # a delimiter at the end of every row
-        first = first[:-1]
-    heads = [cell.strip() for cell in first]
-    if heads:
-        heads[0] = heads[0].removeprefix("#").strip()
+    heads = head_of(first)
     if described.csv.has_header and len(heads) == 1:
         for delimiter in DELIMITERS:
             if delimiter != described.csv.delimiter and len(heads[0].split(delimiter)) > 2:
                 raise ConfigError(f"recording {path} has one column; with `csv.delimiter` = {delimiter!r} it has more")
     return heads
+
+
+def trimmed(cells: list[str]) -> list[str]:
+    """Return the stripped cells of a row without empty ones at its end: a delimiter may end every row."""
+    while cells and not cells[-1].strip():
+        cells = cells[:-1]
+    return [cell.strip() for cell in cells]
+
+
+def head_of(cells: list[str]) -> list[str]:
+    """Return the cells of a head as of `trimmed`, without a "#" at its begin. Raises ValueError if all are empty."""
+    first, *others = trimmed(cells)
+    return [first.removeprefix("#").strip(), *others]
 
 
 def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]]:
