@@ -112,8 +112,8 @@ def test_columns_without_heads_are_found_by_their_slopes(tmp_path, motion):
 
 def test_semicolons_decimal_commas_and_lines_above_the_head_are_found(tmp_path, motion):
     rows = table("", motion.t, motion.q, motion.tau, delimiter=";", form="{:.5f}".format).replace(".", ",")
-    _, keys = draft(tmp_path, f"Recorder 3.1\nArm;left\nt;q1;q2;tau1;tau2\ns;deg;deg;Nm;Nm\n{rows}")
-    assert keys["csv"] == {"delimiter": ";", "decimal": ",", "skip_rows": 2}
+    _, keys = draft(tmp_path, f'Recorder 3.1\n"Arm\nleft"\nt;q1;q2;tau1;tau2\ns;deg;deg;Nm;Nm\n{rows}')
+    assert keys["csv"] == {"delimiter": ";", "decimal": ",", "skip_rows": 3}
     assert keys["units"] == {"q": "deg"}
 
 

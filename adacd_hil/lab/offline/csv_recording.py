@@ -113,7 +113,7 @@ def head_of(cells: list[str]) -> list[str]:
 
 
 def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]]:
-    """Yield each row's number in the file, from 1, and its cells.
+    """Yield the number of each row's last line in the file, from 1, and its cells.
 
     The first `csv.skip_rows` lines are skipped, but counted in the numbers. Empty rows are skipped, too. Raises
     LogError as `opened_text` and `split_rows`.
@@ -122,9 +122,9 @@ def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]
     with opened_text(path) as file:
         for _ in range(form.skip_rows):
             next(file, "")
-        for number, cells in enumerate(split_rows(path, file, form.delimiter), start=1 + form.skip_rows):
+        for number, cells in split_rows(path, file, form.delimiter):
             if any(map(str.strip, cells)):
-                yield number, cells
+                yield number + form.skip_rows, cells
 
 
 @contextmanager
@@ -147,17 +147,19 @@ def opened_text(path: Path) -> Iterator[TextIO]:
         raise LogError(f"recording {path}: {error.strerror or error}") from None
 
 
-def split_rows(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
-    """Yield the cells of each line; a delimiter " " is any white space, but none behind a "#" that begins the line.
+def split_rows(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of each row's last line, from 1, and its cells: a quoted cell may have several lines.
 
-    Raises LogError, with `path`, for bad CSV.
+    A delimiter " " is any white space, but none behind a "#" that begins the line, and quotes mean nothing then. Raises
+    LogError, with `path`, for bad CSV.
     """
     if delimiter == " ":
-        yield from (re.sub(r"^\s*#\s+", "#", line).split() for line in lines)
+        yield from enumerate((re.sub(r"^\s*#\s+", "#", line).split() for line in lines), start=1)
         return
     rows = csv.reader(lines, delimiter=delimiter)
     try:
-        yield from rows
+        for cells in rows:
+            yield rows.line_num, cells
     except csv.Error as error:
         raise LogError(f"recording {path}, row {rows.line_num}: {error}") from None
 

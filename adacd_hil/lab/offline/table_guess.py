@@ -135,10 +135,11 @@ def _form(path: Path, lines: list[str]) -> _Form:
     best: _Form | None = None
     for delimiter in DELIMITERS:
         for decimal in (".", ",") if delimiter != "," else (".",):
-            rows = list(map(trimmed, split_rows(path, lines[:_HEAD_ROWS], delimiter)))
+            table = list(split_rows(path, lines[:_HEAD_ROWS], delimiter))
+            rows = [trimmed(cells) for _, cells in table]
             first = next((k for k in range(len(rows)) if _begins(rows[k : k + _FULL_ROWS], decimal)), None)
             if first is not None and (best is None or len(rows[first]) > len(best[1])):
-                best = _form_at(rows, first, delimiter, decimal)
+                best = _form_at(rows, [0, *(number for number, _ in table)], first, delimiter, decimal)
     if best is None:
         raise LogError(f"recording {path}: no rows of numbers in its first {_HEAD_ROWS} lines")
     return best
@@ -150,8 +151,8 @@ def _begins(rows: list[list[str]], decimal: str) -> bool:
     return len(rows) == _FULL_ROWS and count >= 3 and all(len(row) == count and _is_full(row, decimal) for row in rows)
 
 
-def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) -> _Form:
-    """Return the form of a file whose data begin at row `first`, from 0.
+def _form_at(rows: list[list[str]], skipped: list[int], first: int, delimiter: str, decimal: str) -> _Form:
+    """Return the form of a file whose data begin at row `first`, from 0. skipped: number of lines above each row.
 
     The head is the closest row above with as many cells, the first of them not empty; a row of units may lie between.
     Without such a row, the heads are "1", "2", ….
@@ -161,12 +162,12 @@ def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) ->
     units: tuple[str, ...] = ("",) * count
     if len(above) > 1 and any(map(unit_of, rows[above[-1]])):
         units = tuple(map(unit_of, rows[above.pop()]))
-    if not above:
-        return CsvSection(delimiter, decimal, False, first), tuple(str(k + 1) for k in range(count)), units, first
-    return CsvSection(delimiter, decimal, True, above[-1]), tuple(head_of(rows[above[-1]])), units, first
+    head = above[-1] if above else first
+    heads = head_of(rows[head]) if above else [str(k + 1) for k in range(count)]
+    return CsvSection(delimiter, decimal, bool(above), skipped[head]), tuple(heads), units, first
 
 
-def _values(rows: Iterable[list[str]], count: int, decimal: str) -> tuple[Vector, bool]:
+def _values(rows: Iterable[tuple[int, list[str]]], count: int, decimal: str) -> tuple[Vector, bool]:
     """Return the cells as numbers (k, count), dates in s, nan for other cells, and whether the first column has dates.
 
     It has if the first cell of the first row with all cells is no number. Rows with fewer than `count` cells are left
@@ -174,7 +175,7 @@ def _values(rows: Iterable[list[str]], count: int, decimal: str) -> tuple[Vector
     """
     table: list[list[float]] = []
     is_iso = False
-    for cells in islice(rows, _SEEN_ROWS):
+    for _, cells in islice(rows, _SEEN_ROWS):
         if len(cells) >= count:
             is_iso |= not table and not is_number(cells[0], decimal)
             table.append([_number(cell.strip(), decimal) for cell in cells[:count]])
