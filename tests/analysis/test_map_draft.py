@@ -135,7 +135,9 @@ def test_dates_are_found_and_tell_the_interval_of_the_rows(tmp_path, motion):
 
 
 def test_a_period_that_nobody_says_is_left_to_be_written(tmp_path, motion):
-    _, keys = draft(tmp_path, table("q1,q2,tau1,tau2", motion.q, motion.tau))
+    heads = "T1 [Nm],T2 [Nm],i1 [A],i2 [A],q1 [rad],q2 [rad]"
+    _, keys = draft(tmp_path, table(heads, motion.tau, motion.tau, motion.q))
+    assert keys["columns"] == {"q": ["q1 [rad]", "q2 [rad]"], "tau_J": ["T1 [Nm]", "T2 [Nm]"]}
     assert keys["sampling"] == {"period_s": 0.0}
     played = called("identify", tmp_path / "r.csv", "--map", tmp_path / "map.toml")
     assert played.exit_code == 2

@@ -259,12 +259,16 @@ def _taken_apart(place: int, text: str, joint_names: Sequence[str]) -> _Head:
 def _role(words: tuple[str, ...], unit: str) -> str:
     """Return "time", "q", "dq", "tau_J", "current" or "contact", by a head's words, else by its unit.
 
-    "" if neither tells the role, or a word is of another quantity, such as an acceleration.
+    A word of time doesn't count beside a unit of another role: T is a torque, too. "" if neither tells the role, or a
+    word is of another quantity, such as an acceleration.
     """
     if any(word in _OTHERS for word in words):
         return ""
-    found = (role for role, known in _ROLES.items() if any(word in known for word in words))
-    return next(found, "") or _UNIT_ROLES.get(unit, "")
+    by_unit = _UNIT_ROLES.get(unit, "")
+    found = [role for role, known in _ROLES.items() if any(word in known for word in words)]
+    if by_unit not in ("", "time") and "time" in found:
+        found.remove("time")
+    return found[0] if found else by_unit
 
 
 # By values.
