@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from called import called
 from foreign_arms import AXES, Motion, record, rigid_torque, urdf_text, write_recording
+from joint_state_bags import State, write_mcap
 from scipy.integrate import solve_ivp
 
 from adacd_hil.lab.offline.column_checks import CORRECT_UNITS
 from adacd_hil.lab.offline.recording_identification import Identified, identify
 from adacd_hil.lab.offline.recording_import import read_recording
 from adacd_hil.lab.offline.recording_map import read_map
+from adacd_hil.lab.offline.recording_verdict import Verdict
 from adacd_hil.lab.serial_arm.urdf import read_urdf
 
 LEVEL, UPRIGHT = ("0 0 1",) * 7, ("0 1 0",) * 7
@@ -560,6 +562,25 @@ def test_noise_of_velocities_that_hides_contacts_is_a_remark(tmp_path, upright):
     noisy = replace(upright, dq=upright.dq + 1.0 * np.random.default_rng(5).standard_normal(upright.dq.shape))
     verdict = judged(tmp_path, noisy, has_dq=True).verdict
     assert any("noise of the velocities, 1 rad/s, hides contacts" in remark for remark in verdict.remarks)
+
+
+def test_velocities_of_a_bag_are_measured_though_no_key_names_them(tmp_path, upright):
+    write_recording(tmp_path, urdf_text(2, UPRIGHT), upright)
+    (tmp_path / "map.toml").write_text('[arm]\nurdf = "arm.urdf"\n')
+    described, names = read_map(tmp_path / "map.toml"), ("joint1", "joint2")
+
+    def judged_bag(motion: Motion) -> Verdict:
+        rows = zip(*(values.tolist() for values in (motion.t, motion.q, motion.dq, motion.tau)), strict=True)
+        path = write_mcap(tmp_path / "r.mcap", [State(t, names, *values) for t, *values in rows])
+        return identify(described, [read_recording(path, described)], None).verdict
+
+    mixed = judged_bag(times(q=1 / DEGREE)(upright))
+    assert mixed.reasons[0].startswith("the positions are degrees")
+    turned = judged_bag(times(dq=TURNED)(upright))
+    assert turned.reasons[0].startswith("the velocity of joint2 has the other sign")
+    assert "of a bag `velocity` in its messages" in turned.remedy
+    noisy = judged_bag(replace(upright, dq=upright.dq + noise(upright.dq.shape) / 0.02))
+    assert any("noise of the velocities, 1 rad/s, hides contacts" in remark for remark in noisy.remarks)
 
 
 def test_joints_at_rest_are_named_in_one_reason(tmp_path):

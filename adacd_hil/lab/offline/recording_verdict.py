@@ -25,6 +25,7 @@ import numpy as np
 from adacd_hil.lab.offline.column_checks import (
     CLIPPED_REMEDY,
     CORRECT_UNITS,
+    LEFT_OUT_REMEDY,
     RecordingFinding,
     clipped_torque,
     find_faults,
@@ -115,6 +116,11 @@ class Fitted:
     def fit_s(self) -> float:
         """Length of the fitted recordings, s."""
         return sum(recording.duration_s for recording in self.fitted)
+
+    @property
+    def has_velocities(self) -> bool:
+        """Whether the velocities of all recordings were measured, not derived from the positions."""
+        return all(recording.has_velocities for recording in (*self.fitted, self.tested))
 
 
 def judge_fit(fit: Fitted) -> Verdict:
@@ -241,7 +247,7 @@ def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Ite
     the likeliest explains less than the share `least` of a joint's torque.
     """
     fitted = [record for recording in fit.fitted for record in recording.records]
-    readings = find_readings(fit.described, fit.model, fit.settings, fitted, fit.tested.records)
+    readings = find_readings(fit.described, fit.model, fit.settings, fitted, fit.tested.records, fit.has_velocities)
     if not readings or 1.0 - readings[0].unexplained < least:
         return
     text = ", or ".join(reading.text for reading in readings[:3])
@@ -535,8 +541,8 @@ def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[Recordin
     if loud:
         each = ", ".join(f"{joints[i].name} {contact_Nm[i]:.2g} Nm" for i in loud)
         noise = fit.settings.velocity_noise_rad_s
-        source = f" of the velocities, {noise:.2g} rad/s," if noise and fit.described.columns.dq else ""
-        remedy = "; without `columns.dq` they are derived from the positions" if source else ""
+        source = f" of the velocities, {noise:.2g} rad/s," if noise and fit.has_velocities else ""
+        remedy = f"; {LEFT_OUT_REMEDY}" if source else ""
         yield RecordingFinding(
             f"noise{source} hides contacts smaller than the torque itself: they show from about {each} on{remedy}",
             is_against=False,
