@@ -512,6 +512,13 @@ def test_torques_of_a_third_of_what_the_masses_need_are_a_remark(tmp_path, uprig
     assert any(remark.startswith("the torques are 0.4") for remark in verdict.remarks)
 
 
+@pytest.mark.parametrize("joint", [0, 1])
+def test_whichever_joint_has_no_torque_in_the_test_the_others_tell_the_unit(tmp_path, upright, joint):
+    tau = 1e3 * upright.tau
+    tau[1430:, joint] = 0.0
+    assert "they are mNm" in judged(tmp_path, replace(upright, tau=tau)).verdict.reasons[0]
+
+
 def test_masses_of_a_urdf_that_are_none_make_no_verdict(tmp_path, upright):
     """Some have a thousandth of a kilogram to please a simulator."""
     verdict = judged(tmp_path, upright, density=1e-3).verdict

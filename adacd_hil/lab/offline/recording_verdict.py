@@ -167,7 +167,7 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Recor
         return [*scale, *remarks]
     if not all(_is_noise(fit, joints)) and (readings := list(_of_readings(fit, joints, WHOLE if columns else 0.0))):
         return [*readings, *remarks]
-    if is_good and not (columns and min(joint.share for joint in joints) < WHOLE):
+    if is_good and not (columns and _least_share(joints) < WHOLE):
         return [*scale, *remarks]
     lack = list(_of_lack(fit, joints))
     causes = wrong or list(columns)
@@ -216,13 +216,18 @@ def percent(share: float) -> str:
     return f"{100.0 * max(share, 0.0):.{digits}f} %" if share < 0.99995 else "100.0 %"
 
 
+def _least_share(joints: Sequence[JointShare]) -> float:
+    """Return the smallest share of the joints with torque; nan if none has."""
+    return min((joint.share for joint in joints if not math.isnan(joint.share)), default=math.nan)
+
+
 def _headline(fit: Fitted, joints: Sequence[JointShare], is_explained: bool) -> str:
-    shares = [joint.share for joint in joints if not math.isnan(joint.share)]
-    least = f"{percent(min(shares))} of the torque" if shares else "no torque"
+    share = _least_share(joints)
+    if math.isnan(share):
+        return "NOT explained: no torque"
+    least = f"{percent(share)} of the torque"
     where = " at the worst joint" if len(joints) > 1 else ""
     margin = f"margin {fit.certificate.margin:.2f}" if math.isfinite(fit.certificate.margin) else "no margin"
-    if not shares:
-        return f"NOT explained: {least}"
     if is_explained:
         return f"explained; {margin}" if fit.certificate.margin >= 1.0 else f"explained: {least}{where}; {margin}"
     if all(joint.is_explained for joint in joints):
@@ -251,7 +256,7 @@ def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Ite
     if not readings or 1.0 - readings[0].unexplained < least:
         return
     text = ", or ".join(reading.text for reading in readings[:3])
-    by_map, where = percent(min(joint.share for joint in joints)), " at the worst joint" if len(joints) > 1 else ""
+    by_map, where = percent(_least_share(joints)), " at the worst joint" if len(joints) > 1 else ""
     yield RecordingFinding(
         f"{text}: so {percent(1.0 - readings[0].unexplained)} of the torque is explained{where}, {by_map} as the map "
         "has it",
@@ -348,13 +353,14 @@ def _predicted_share(fitted: Vector, tested: Vector) -> float:
 def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
     """Report a unit of torques or angles by which the torques differ from the URDF's masses, or an impossible inertia.
 
-    The ratio to the masses is judged if it is over `_SIGMAS` deviations and every joint's share over `_MOSTLY`; an
-    angle needs shares of `WHOLE`. A ratio that isn't reported as a unit is a remark if it is over `_ODD_SCALE` or below
-    its reciprocal. The inertia about joint 1 is judged if no unit was reported and every share is at least `HALF`.
+    Joints without torque don't count. The ratio to the masses is judged if it is over `_SIGMAS` deviations and every
+    joint's share over `_MOSTLY`; an angle needs shares of `WHOLE`. A ratio that isn't reported as a unit is a remark if
+    it is over `_ODD_SCALE` or below its reciprocal. The inertia about joint 1 is judged if no unit was reported and
+    every share is at least `HALF`.
     """
     scale, sigma = _scale_of_urdf(fit)
     mass_kg = _mass_at_reach(fit)
-    units, least = fit.described.units, min(joint.share for joint in joints)
+    units, least = fit.described.units, _least_share(joints)
     if scale is not None and abs(scale) > _SIGMAS * sigma and least > _MOSTLY:
         text = f"the torques are {scale:.3g} times those that the masses of the URDF need"
         meant = _milli(abs(scale), mass_kg, units.tau_J)
