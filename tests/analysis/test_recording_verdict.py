@@ -279,13 +279,13 @@ def test_a_wrong_model_says_how_far_it_is_off(tmp_path, upright):
     assert "`arm.has_rotors` = true" in motors.remedy
 
 
-def test_friction_that_drives_and_a_negative_term_of_it_are_said(tmp_path, upright):
+def test_friction_that_is_negative_is_said_with_both_terms(tmp_path, upright):
     compensated = replace(upright, tau=upright.tau - 2.0 * upright.truth["F_c"] * np.sign(upright.dq))
     verdict = judged(tmp_path, compensated, has_dq=True).verdict
-    assert any(remark.startswith("friction drives joint1 on: F_v ") for remark in verdict.remarks)
+    assert any(re.match("friction of joint1 is negative: F_v .*, F_c -0.5", remark) for remark in verdict.remarks)
     curved = replace(upright, tau=upright.tau - 0.5 * upright.truth["F_v"] * upright.dq * 3.0)
     verdict = judged(tmp_path, curved, has_dq=True).verdict
-    assert any(remark.startswith("F_v1 of joint1 is negative, -0.1") for remark in verdict.remarks)
+    assert any(remark.startswith("friction of joint1 is negative: F_v -0.1") for remark in verdict.remarks)
 
 
 def test_an_inertia_that_no_masses_make_is_said(tmp_path, level):

@@ -449,30 +449,16 @@ def _of_inertia(fit: Fitted) -> Iterator[RecordingFinding]:
 
 
 def _of_friction(fit: Fitted) -> Iterator[RecordingFinding]:
-    """Report, as remarks, friction that drives a joint on, or whose viscous or Coulomb term is negative.
-
-    It must be so by more than `_SIGMAS` deviations.
-    """
-    speed = np.abs(samples((fit.tested,), "dq"))
+    """Report, as remarks, joints whose viscous or Coulomb friction is negative by more than `_SIGMAS` deviations."""
     theta, deviation = fit.estimate.theta, fit.deviation
-    mean, square = speed.mean(axis=0), (speed**2).mean(axis=0)
     for joint, name in enumerate(fit.described.urdf.joint_names):
         F_v, F_c = (fit.model.place_of(kind).start + joint for kind in ("F_v", "F_c"))
-        power = theta[F_c] * mean[joint] + theta[F_v] * square[joint]
-        sigma = math.hypot(deviation[F_c] * mean[joint], deviation[F_v] * square[joint])
-        if power < -_SIGMAS * sigma:
+        if any(theta[place] < -_SIGMAS * deviation[place] for place in (F_v, F_c)):
             yield RecordingFinding(
-                f"friction drives {name} on: F_v {theta[F_v]:.3g} ± {deviation[F_v]:.1g} Nm s/rad, F_c "
-                f"{theta[F_c]:.3g} ± {deviation[F_c]:.1g} Nm",
+                f"friction of {name} is negative: F_v {theta[F_v]:.3g} ± {deviation[F_v]:.1g} Nm s/rad, F_c "
+                f"{theta[F_c]:.3g} ± {deviation[F_c]:.1g} Nm; it drives the joint, or its curve is no straight line",
                 is_against=False,
             )
-        for place, unit in ((F_v, "Nm s/rad"), (F_c, "Nm")):
-            if power >= -_SIGMAS * sigma and theta[place] < -_SIGMAS * deviation[place]:
-                yield RecordingFinding(
-                    f"{fit.model.parameter_names[place]} of {name} is negative, {theta[place]:.3g} ± "
-                    f"{deviation[place]:.1g} {unit}: the friction's curve is not a straight line",
-                    is_against=False,
-                )
 
 
 def _of_excitation(fit: Fitted) -> Iterator[RecordingFinding]:
