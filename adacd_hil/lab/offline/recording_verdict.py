@@ -184,9 +184,8 @@ def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
 
 def _shares(fit: Fitted) -> tuple[JointShare, ...]:
     """Return each joint's result of the test, in their order: explained share, margin, rms torque, explained or not."""
-    parts = [offline.filtered(fit.model, record, fit.estimate, fit.settings) for record in fit.tested.records]
-    torque, residual = (np.concatenate([getattr(part, name) for part in parts]) for name in ("tau_f", "tau_ext_hat"))
-    unit = np.concatenate([part.unit for part in parts])
+    trace = offline.filtered(fit.model, fit.tested.records, fit.estimate, fit.settings)
+    torque, residual, unit = trace.tau_f, trace.tau_ext_hat, trace.unit
     spread = torque - np.outer(unit, unit @ torque / (unit @ unit))
     squares, left = np.sum(spread**2, axis=0), np.sum(residual**2, axis=0)
     is_there = squares > 1e-18 * np.maximum(np.sum(torque**2, axis=0), 1e-12)
