@@ -2,7 +2,7 @@
 
 `free_motion` defines the motion that counts. The detectors run over all of this motion, and thresholds come from all of
 their statistics. The velocity's lag (by regression of the stream on the filtered slope of the torque), the stream's
-covariance and the causes of a threshold come from the same motion, of more than `MOST_SAMPLES` from windows of it.
+covariance and the causes of a threshold come from the same motion, of more than `MOST_SAMPLES` from pieces of it.
 """
 
 from collections.abc import Sequence
