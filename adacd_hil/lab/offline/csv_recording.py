@@ -22,7 +22,7 @@ from adacd_hil.lab.offline.recorded_columns import RecordedColumns, RecordedRows
 from adacd_hil.lab.offline.recording_map import ISO, TIME_S, RecordingMap, unit_of
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import TimeWindow
-from adacd_hil.remedies import nearest_name
+from adacd_hil.remedies import hint, nearest_name
 from adacd_hil.settings.schema import ConfigError
 
 DELIMITERS: Final = (",", ";", "\t", " ")
@@ -210,9 +210,7 @@ def _place(path: Path, name: str, heads: list[str], cells: int) -> int:
         return heads.index(name)
     if name.isdecimal() and 1 <= int(name) <= cells:
         return int(name) - 1
-    nearest = nearest_name(name, heads)
-    known = f"did you mean {nearest!r}?" if nearest else f"there are {', '.join(heads) or f'1 to {cells}'}"
-    raise ConfigError(f"recording {path} has no column {name!r}; {known}")
+    raise ConfigError(f"recording {path} has no column {name!r}; {hint(name, heads or (f'1 to {cells}',))}")
 
 
 def _numbers(
