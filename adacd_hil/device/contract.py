@@ -12,7 +12,7 @@ from typing import NamedTuple
 from adacd_hil.device.canopen_bus import EdsVariable
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, ObjectName, PdoSettings, PlacedDevice
 from adacd_hil.file_access import exists
-from adacd_hil.remedies import nearest_name
+from adacd_hil.remedies import hint
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec, MessageCodec
@@ -128,9 +128,7 @@ def find_contract(name: str) -> Path:
     if name and (path.suffix or exists(path)):
         return path
     known = sorted(path.stem for path in folder.glob("*.dbc"))
-    nearest = nearest_name(name, known)
-    hint = f"did you mean {nearest!r}?" if nearest else f"known: {', '.join(known)}"
-    raise ConfigError(f"contract {name!r} is neither in dbc/ nor a file; {hint}")
+    raise ConfigError(f"contract {name!r} is neither in dbc/ nor a file; {hint(name, known)}")
 
 
 def _move(codec: Codec, settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
