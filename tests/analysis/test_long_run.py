@@ -11,7 +11,7 @@ from hand_made_run import make_certified_run, make_run, react, record, record_tr
 
 from adacd_hil.lab.logs.cut import cut
 from adacd_hil.lab.report import run_reading
-from adacd_hil.lab.report.page import left_out_text, shown_contacts
+from adacd_hil.lab.report.page import left_out_text, shown_contacts, stretch_text
 from adacd_hil.lab.report.report_files import write_run_report
 from adacd_hil.lab.report.report_json import report_json
 from adacd_hil.lab.report.run_reading import TruthClock, read_run
@@ -195,6 +195,20 @@ def test_a_stretch_that_would_cut_something_is_widened(certified, asked, found):
     assert run.stretch.found[1] <= found[1] + 1e-9
 
 
+@pytest.mark.parametrize(
+    ("bounds", "text"),
+    [
+        ({"start_s": 2.8, "end_s": 3.5}, "from 2.8 s until 3.5 s"),
+        ({"start_s": 2.8}, "from 2.8 s"),
+        ({"end_s": 3.5}, "until 3.5 s"),
+        ({"end_s": 4.01}, "until 5.25 s, widened so that no contact and no adaptation is cut"),
+    ],
+)
+def test_the_words_for_a_stretch_name_the_bounds_that_it_has_and_say_whether_it_was_widened(certified, bounds, text):
+    run = read_run(certified, truth_of(certified), TimeWindow(**bounds)).run
+    assert stretch_text(run.stretch) == f"the log {text}"
+
+
 def test_a_contact_of_a_stretch_is_what_it_is_in_the_whole_log(certified):
     whole = evaluate(read_run(certified, truth_of(certified)).run).contacts[1]
     (part,) = evaluate(stretched(certified, 2.9, 4.9).run).contacts
@@ -282,7 +296,7 @@ def test_the_report_of_a_stretch_says_which_it_is(certified, tmp_path):
         "motion_start_s": pytest.approx(0.05),
     }
     page = (tmp_path / "report.html").read_text()
-    assert "the log from 2.90 s until 5.25 s, widened so that no contact and no adaptation is cut" in page
+    assert "the log from 2.9 s until 5.25 s, widened so that no contact and no adaptation is cut" in page
 
 
 def test_of_many_contacts_the_first_are_listed_and_those_that_went_wrong(certified):

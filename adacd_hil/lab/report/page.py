@@ -9,7 +9,6 @@ The size of a report is bounded, whatever the length of the run. The tables as C
 """
 
 import hashlib
-import math
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from functools import cache
@@ -22,6 +21,7 @@ from adacd_hil.lab.score.metrics import Beside, Metrics, ReportedContact
 from adacd_hil.lab.score.report_wording import number_text
 from adacd_hil.lab.score.run_arrays import StretchOfRun
 from adacd_hil.lab.score.verdict import BETA, CAD_BY_SECTION, FILTERS, FROZEN_BY_SECTION, HOLD, SMALLEST_MARGIN
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.score.wording import NONE
 from adacd_hil.terminal import keep_units
 
@@ -227,12 +227,6 @@ def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
 
 def stretch_text(stretch: StretchOfRun) -> str:
     """Return a phrase on the time window of a log that was read; if it is wider than requested, the phrase says why."""
-    start_s, end_s = stretch.found
-    text = (
-        "the log"
-        + ("" if math.isinf(start_s) else f" from {start_s:.2f} s")
-        + ("" if math.isinf(end_s) else f" until {end_s:.2f} s")
-    )
-    if stretch.found == stretch.asked:
-        return text
-    return f"{text}, widened so that no contact and no adaptation is cut"
+    found = TimeWindow(*(round(bound_s, 2) for bound_s in stretch.found))
+    is_wider = stretch.found != stretch.asked
+    return f"the log {found.text}{', widened so that no contact and no adaptation is cut' if is_wider else ''}"

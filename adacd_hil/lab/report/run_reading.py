@@ -632,28 +632,23 @@ def _widened(run: Run, shell: Run, stretch: TimeWindow, start_ns: int) -> tuple[
     has motion start, truth and stretch.
     """
     zero_ns = run.zero_ns
+    motion_start_s = (zero_ns - start_ns) * 1e-9
     first_s, last_s = ((bound_ns - zero_ns) * 1e-9 for bound_ns in stretch.bounds_ns(start_ns))
-    busy = sorted(_busy(run))
+    found, busy = stretch, sorted(_busy(run))
     for begin_s, end_s in reversed(busy):
         if begin_s < first_s < end_s:
-            first_s = begin_s
+            first_s, found = begin_s, found._replace(start_s=motion_start_s + begin_s)
     for begin_s, end_s in busy:
         if begin_s < last_s < end_s:
-            last_s = end_s
-    bounds_ns = (round(first_s * 1e9) + zero_ns, round(last_s * 1e9) + zero_ns)
+            last_s, found = end_s, found._replace(end_s=motion_start_s + end_s)
     begun_s = [float(each.time_s[0]) for each in timed_contacts(run) if each.time_s is not None]
     if run.truth is None:
         begun_s = [(detection.t_ns - zero_ns) * 1e-9 for detection in find_detections(run)]
-    known = StretchOfRun(
-        stretch,
-        TimeWindow(*((bound_ns - start_ns) * 1e-9 for bound_ns in bounds_ns)),
-        sum(at_s < first_s for at_s in begun_s),
-        (zero_ns - start_ns) * 1e-9,
-    )
+    known = StretchOfRun(stretch, found, sum(at_s < first_s for at_s in begun_s), motion_start_s)
     truth = run.truth
     if truth is not None and truth.time_s is not None:
         truth = truth_rows(truth, (truth.time_s >= first_s) & (truth.time_s < last_s))
-    return replace(shell, motion_start_ns=zero_ns, truth=truth, stretch=known), bounds_ns
+    return replace(shell, motion_start_ns=zero_ns, truth=truth, stretch=known), found.bounds_ns(start_ns)
 
 
 def _busy(run: Run) -> Iterator[tuple[float, float]]:
