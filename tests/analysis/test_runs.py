@@ -14,6 +14,7 @@ from called import called
 from hand_made_run import A, M, make_certified_run, make_run, record
 
 from adacd_hil.file_access import create_file
+from adacd_hil.lab.logs.cut import cut
 from adacd_hil.lab.report.report_json import report_json
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.runs.run_summary import (
@@ -34,6 +35,7 @@ from adacd_hil.lab.runs.run_trend import trends
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.log.recording.recorder import Recorder
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration_files import load_settings
 
@@ -114,6 +116,13 @@ def test_a_run_without_a_report_is_judged_when_asked(one):
     quick = summarise(one)
     assert (quick.status, quick.threshold_Nm) == (NOT_JUDGED, None)
     assert judged(quick) == asked
+
+
+def test_a_whole_log_of_which_not_all_could_be_judged_is_not_called_damaged(one, tmp_path):
+    (tmp_path / "part").mkdir()
+    cut(one / "run.mcap", tmp_path / "part" / "run.mcap", TimeWindow(end_s=0.1))
+    run = judged(summarise(tmp_path / "part"))
+    assert run.verdict.endswith(". Not all could be judged: the log is a cut of its run until 0.1 s")
 
 
 def test_a_log_is_broken_though_a_report_of_it_is_there(one):

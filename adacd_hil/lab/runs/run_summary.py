@@ -359,7 +359,6 @@ def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
     """
     log, certified = table["log"], table["certified"]
     is_good = _flag(table["is_clean"]) and _flag(log["is_complete"])
-    missing = f" The log is not whole: {_text(log['problem'])}" if log["problem"] else ""
     armed = [contact for contact in table["contacts"] if _flag(contact["is_armed"])]
     false_alarms = table["false_alarms"]
     has_truth = false_alarms is not None
@@ -368,7 +367,7 @@ def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
     return dataclasses.replace(
         summary,
         status=GOOD if is_good else NOT_GOOD,
-        verdict=one_line(_text(table["verdict"]) + missing),
+        verdict=one_line(" ".join(filter(None, (_text(table["verdict"]), _text(log["problem"]))))),
         certificate=_reported_certificate(summary, table),
         threshold_Nm=configured_Nm if certified is None else _threshold(table),
         margin=None if certified is None else _number(certified["smallest_margin"]),

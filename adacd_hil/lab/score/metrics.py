@@ -262,11 +262,6 @@ class ReportSource(NamedTuple):
     truth: str = ""
 
     @property
-    def problem(self) -> str:
-        """Problems of log and truth in one line; "" without any."""
-        return "; ".join(filter(None, (self.log_problem, self.truth_problem)))
-
-    @property
     def notice(self) -> str:
         """One line for a reader on the problems of log and truth; "" without any."""
         log = f"The log is not whole: {self.log_problem}" if self.log_problem else ""
