@@ -1,7 +1,7 @@
 """The tables of a report's page, those of the timing evidence included, those of contacts not."""
 
 from collections.abc import Mapping, Sequence
-from itertools import islice
+from itertools import compress, islice
 from string import ascii_letters
 from typing import Final
 
@@ -11,9 +11,8 @@ from adacd_hil.lab.report.page import (
     SECTIONS,
     Cell,
     Table,
+    has_paper,
     make_table,
-    paper_cells,
-    paper_head,
     stretch_text,
 )
 from adacd_hil.lab.score.evaluation import OLDEST_CYCLES
@@ -28,17 +27,45 @@ from adacd_hil.lab.score.metrics import (
 )
 from adacd_hil.lab.score.report_wording import number_text, pair_text, percent_text, rate_sentence, signed_text
 from adacd_hil.lab.score.run_arrays import QUANTITIES, Quantity, Run
+from adacd_hil.lab.score.verdict import BETA, CAD_BY_SECTION, FILTERS, FROZEN_BY_SECTION, HOLD, SMALLEST_MARGIN
 from adacd_hil.records import PARAMETER_UNITS
 from adacd_hil.score.distribution import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES
 from adacd_hil.score.smallest_push import PUSH_WITHIN
 from adacd_hil.score.wording import NONE, number_of
 
+_PLAIN_NAMES: Final = {
+    FROZEN_BY_SECTION[0]: "Largest unexplained torque, first detection section",
+    FROZEN_BY_SECTION[1]: "Largest unexplained torque, second detection section",
+    CAD_BY_SECTION[0]: "The same with the CAD model, first detection section",
+    CAD_BY_SECTION[1]: "The same with the CAD model, second detection section",
+    BETA: "Residual that learning must come below",
+    HOLD: "How long it must stay there, or was tested",
+    FILTERS: "Filter of the residual",
+    SMALLEST_MARGIN: "Smallest margin: threshold over unexplained torque",
+}
+"""Names of quantities for readers who do not know the paper; report.json keeps the paper's."""
+
 
 def paper_table(metrics: Metrics) -> Table:
-    """Return the table of `paper_cells`: the paper's figures, if any, beside the measured ones."""
-    rows = [[*cells[:-1], Cell(cells[-1], "strong")] for cells in paper_cells(metrics)]
-    head = paper_head(metrics)
-    return make_table(head, rows, left=range(len(head)))
+    """Return the table of measured quantities; quantities without any value are left out.
+
+    If the paper's experiment was played, the paper's values stand beside them and, for a certified run, those of its
+    scheme on the same stream.
+    """
+    is_paper, is_certified = has_paper(metrics), metrics.evidence is not None
+    columns = (True, is_paper, is_paper and is_certified, True)
+    head = ("", "paper (printed)", "paper's scheme, same stream", "certified")
+    if not is_certified:
+        head = ("", "paper", "", "measured")
+    names = {} if is_paper else _PLAIN_NAMES
+    rows = [
+        (names.get(row.quantity, row.quantity), row.paper, row.beside, Cell(row.measured, "strong"))
+        for row in metrics.paper
+        if is_paper or row.measured != NONE
+    ]
+    return make_table(
+        list(compress(head, columns)), [list(compress(row, columns)) for row in rows], left=range(len(head))
+    )
 
 
 def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
