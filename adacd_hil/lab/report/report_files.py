@@ -21,11 +21,10 @@ from adacd_hil.lab.report.page import has_paper, went_wrong
 from adacd_hil.lab.report.report_json import JSON_NAME, report_json
 from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.report.run_reading import read_run
-from adacd_hil.lab.report.timeline import stays_of
 from adacd_hil.lab.score.evaluation import RunGatherer, evaluate
 from adacd_hil.lab.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.lab.score.report_wording import number_text
-from adacd_hil.lab.score.run_arrays import Run, section_at
+from adacd_hil.lab.score.run_arrays import Run, section_at, stays_of
 from adacd_hil.lab.score.verdict import headlines, is_good
 from adacd_hil.log.log_files import failing_as
 from adacd_hil.log.logged_run import Progress

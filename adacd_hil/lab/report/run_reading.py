@@ -51,12 +51,13 @@ from adacd_hil.lab.score.run_arrays import (
     is_realtime,
     last_cycle,
     split_sections,
+    stays_of,
     truth_rows,
 )
 from adacd_hil.lab.score.run_judge import find_detections, timed_contacts, uncovered_watch
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, DBC_NAME, ENDING_KEY, TRUTH_NAME, LogError
 from adacd_hil.log.log_parts import CUT, PLANNED_ENDINGS, whole_number
-from adacd_hil.log.logged_run import Cycles, Mask, Milestones, Progress, host_cycles, settings_of
+from adacd_hil.log.logged_run import Cycles, Milestones, Progress, host_cycles, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series, contacts_of, start_of_log
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, FRAME_CHECKS, SCHEME
@@ -652,15 +653,14 @@ def _widened(run: Run, shell: Run, stretch: TimeWindow, start_ns: int) -> tuple[
 
 
 def _busy(run: Run) -> Iterator[tuple[float, float]]:
-    """Yield start and end, s since motion start, of each true contact and each time in a state of `BUSY`.
+    """Yield start and end, s since motion start, of each true contact and each stay in a state of `BUSY`.
 
     A margin before and the settling time after are included.
     """
-    time_s, later_s = run.time_s(), SETTLING_TIME_CONSTANTS / run.a_rad_s
-    is_busy: Mask = np.concatenate(([False], np.isin(run.state, BUSY), [False]))
-    edges = np.flatnonzero(is_busy[1:] != is_busy[:-1])
-    for first, end in edges.reshape(-1, 2).tolist():
-        yield float(time_s[first]) - MARGIN_S, float(time_s[min(end, len(time_s) - 1)]) + later_s
+    later_s = SETTLING_TIME_CONSTANTS / run.a_rad_s
+    for stay in stays_of(run):
+        if stay.state in BUSY:
+            yield stay.start_s - MARGIN_S, stay.end_s + later_s
     for contact in timed_contacts(run):
         assert contact.time_s is not None
         yield float(contact.time_s[0]) - MARGIN_S, float(contact.time_s[-1]) + later_s

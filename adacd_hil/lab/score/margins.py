@@ -28,7 +28,7 @@ from adacd_hil.lab.score.metrics import (
     Residual,
     certificates_in,
 )
-from adacd_hil.lab.score.run_arrays import CertifiedStream, Run, Section, rows_of, split_sections
+from adacd_hil.lab.score.run_arrays import CertifiedStream, Run, Section, rows_of, split_sections, stays_of
 from adacd_hil.lab.score.run_judge import find_detections, placed_in, timed_contacts
 from adacd_hil.log.logged_run import Mask, is_armed_in
 from adacd_hil.records import JOINTS, SchemeState, Vector
@@ -162,19 +162,6 @@ def last_row(run: Run, section: Section) -> int:
     time_s = run.time_s()
     end = int(rows_of(time_s, section, float(time_s[-1])).stop)
     return end - 1 + int(section.is_complete)
-
-
-def _tests(run: Run, section: Section) -> list[float]:
-    """Return the length of each stay in CERTIFY within a section, s, in the order of time; [] without one.
-
-    A longer stay is cut at the section's end.
-    """
-    time_s = run.time_s()
-    rows = rows_of(time_s, section, float(time_s[-1]))
-    inside = np.concatenate(([False], run.state[rows] == SchemeState.CERTIFY, [False]))
-    edges = np.flatnonzero(inside[1:] != inside[:-1]) + rows.start
-    time_s = np.append(time_s, section.end_s)
-    return [float(time_s[end] - time_s[start]) for start, end in edges.reshape(-1, 2)]
 
 
 def _estimates(run: Run, stream: CertifiedStream, section: Section) -> dict[str, ParameterEstimate]:
@@ -357,10 +344,14 @@ def evaluate_certified(run: Run, sections: Sequence[Section], untouched: Untouch
     if stream is None:
         return None
     adaptations = [section for section in sections if section.kind == "adaptation"]
-    stays = {section.label: _tests(run, section) for section in adaptations}
+    tests = [stay for stay in stays_of(run) if stay.state is SchemeState.CERTIFY]
+    lengths_s = {
+        each.label: [stay.end_s - stay.start_s for stay in tests if each.start_s <= stay.start_s <= each.end_s]
+        for each in adaptations
+    }
     return CertifiedEvidence(
-        tests={label: len(lengths_s) for label, lengths_s in stays.items()},
-        test_s={label: lengths_s[-1] if lengths_s else None for label, lengths_s in stays.items()},
+        tests={label: len(found_s) for label, found_s in lengths_s.items()},
+        test_s={label: found_s[-1] if found_s else None for label, found_s in lengths_s.items()},
         estimates={section.label: _estimates(run, stream, section) for section in adaptations},
         margins=untouched.margins(sections),
         promotions=untouched.promotions,

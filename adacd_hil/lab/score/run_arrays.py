@@ -346,6 +346,31 @@ def origins(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.where(own < 0, np.uint8(SchemeState.MONITOR), state[np.maximum(own, 0)])
 
 
+class Stay(NamedTuple):
+    """A span of time in one state, s since motion start. row: of its first cycle, in the arrays of the run."""
+
+    state: SchemeState
+    start_s: float
+    end_s: float
+    row: int
+
+
+def stays_of(run: Run) -> list[Stay]:
+    """Return the spans of a run in one state each, in order of time; [] for a run without cycles.
+
+    A span ends at the first cycle of the next one, the last span at the last cycle.
+    """
+    if run.state.size == 0:
+        return []
+    edges = np.flatnonzero(run.state[1:] != run.state[:-1]) + 1
+    time_s = run.time_s()
+    ends_s = [*time_s[edges].tolist(), float(time_s[-1])]
+    return [
+        Stay(SchemeState(int(run.state[row])), float(time_s[row]), end_s, row)
+        for row, end_s in zip([0, *edges.tolist()], ends_s, strict=True)
+    ]
+
+
 def split_sections(run: Run) -> tuple[Section, ...]:
     """Return the lettered sections of a run, in the order of time; () for a run without cycles.
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.lab.score.metrics import CyclicData, DeviceShares, Fault
 from adacd_hil.lab.score.report_wording import percent_text
-from adacd_hil.lab.score.run_arrays import CheckCounts, CycleColumns, Run
+from adacd_hil.lab.score.run_arrays import CheckCounts, CycleColumns, Run, stays_of
 from adacd_hil.log.logged_run import Cycles
 from adacd_hil.printable import one_line
 from adacd_hil.records import FaultReason, SchemeState
@@ -36,16 +36,12 @@ def find_faults(run: Run) -> tuple[Fault, ...]:
 
     The run must have the cycles in which the state changes.
     """
-    is_fault = run.state == SchemeState.FAULT
-    before = np.concatenate(([False], is_fault[:-1]))
-    time_s = run.time_s()
-    faults = []
-    for row in np.flatnonzero(is_fault & ~before).tolist():
-        is_last = bool(is_fault[row:].all())
-        faults.append(
-            Fault(FaultReason(int(run.fault[row])).name, float(time_s[row]), _cause(run, int(run.t_ns[row])), is_last)
-        )
-    return tuple(faults)
+    stays = stays_of(run)
+    return tuple(
+        Fault(FaultReason(int(run.fault[row])).name, start_s, _cause(run, int(run.t_ns[row])), row == stays[-1].row)
+        for state, start_s, _, row in stays
+        if state is SchemeState.FAULT
+    )
 
 
 def _cause(run: Run, t_ns: int) -> str:
