@@ -181,7 +181,7 @@ def touched_beside(row, crossing):
 def test_the_papers_scheme_detects_where_it_crosses_its_threshold(row, crossing, told, missed):
     run = touched_beside(row, crossing)
     theirs = beside(run)
-    assert [(c["number"], c["is_armed"], c["delay_ms"]) for c in theirs.contacts] == [told]
+    assert [(c.number, c.is_armed, c.delay_ms) for c in theirs.contacts] == [told]
     assert (theirs.missed, theirs.false_alarms, evaluate(run).missed) == (missed, 0, 0)
 
 

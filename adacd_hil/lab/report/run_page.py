@@ -162,7 +162,7 @@ def contacts_table(metrics: Metrics) -> Table | None:
     if not metrics.contacts:
         return None
     beside = shown_beside(metrics)
-    theirs = {} if beside is None else {each["number"]: each for each in beside.contacts}
+    theirs = {} if beside is None else {each.number: each for each in beside.contacts}
     rows: list[list[object]] = []
     for contact in shown_contacts(metrics, CONTACTS):
         is_found = contact.detected_s is not None
@@ -186,7 +186,7 @@ def contacts_table(metrics: Metrics) -> Table | None:
         ]
         if theirs:
             their = theirs[contact.number]
-            row.append(number_text(their["delay_ms"], 0) if their["is_armed"] else "not armed")
+            row.append(number_text(their.delay_ms, 0) if their.is_armed else "not armed")
         rows.append(row)
     return make_table((*_CONTACT_HEAD, *["paper's scheme ms"][: len(theirs)]), rows, left=())
 

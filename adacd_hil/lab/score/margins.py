@@ -22,6 +22,7 @@ import numpy as np
 
 from adacd_hil.lab.score.metrics import (
     Beside,
+    BesideContact,
     CertifiedEvidence,
     ChannelMargin,
     ParameterEstimate,
@@ -119,12 +120,12 @@ class BesideGatherer:
             adaptation_s={label: self._adaptation_s.get(label) for label in learnt},
             frozen_residual_max_Nm={label: _pair(self._largest.get(label)) for label in watched},
             contacts=tuple(
-                {
-                    "number": contact.number,
-                    "is_armed": contact.is_armed,
-                    "detected_s": None if contact.detected_ns is None else (contact.detected_ns - run.zero_ns) * 1e-9,
-                    "delay_ms": contact.delay_ms,
-                }
+                BesideContact(
+                    contact.number,
+                    contact.is_armed,
+                    None if contact.detected_ns is None else (contact.detected_ns - run.zero_ns) * 1e-9,
+                    contact.delay_ms,
+                )
                 for contact in score.contacts
             ),
             false_alarms=len(false_s) if has_truth else None,

@@ -129,17 +129,29 @@ class CyclicData:
     excesses: tuple[str, ...]
 
 
+class BesideContact(NamedTuple):
+    """What the paper's scheme beside made of a true contact; number: as in the list of contacts.
+
+    detected_s: s since motion start; it and the delay are None if no crossing found the contact.
+    """
+
+    number: int
+    is_armed: bool
+    detected_s: float | None
+    delay_ms: float | None
+
+
 @dataclass(frozen=True)
 class Beside:
     """The results of the paper's scheme that ran beside, by the definitions of the module's first lines.
 
-    contacts: of each true contact `number`, as in the list of contacts, `is_armed`, `detected_s`, `delay_ms`. Without
-    the truth there are no contacts, and false alarms and misses are None. adaptation_s: None where it did not end.
+    Without the truth there are no contacts, and false alarms and misses are None. adaptation_s: None where it did not
+    end.
     """
 
     adaptation_s: dict[str, float | None]
     frozen_residual_max_Nm: dict[str, tuple[float, float] | None]
-    contacts: tuple[dict[str, Any], ...]
+    contacts: tuple[BesideContact, ...]
     false_alarms: int | None
     false_alarms_s: tuple[float, ...] | None
     missed: int | None
