@@ -198,12 +198,6 @@ def with_motion(run: Run) -> Run:
     return replace(run, motion=MeasuredMotion(q, 0.0 * q, 0.0 * q))
 
 
-def like_an_old_log(run: Run) -> Run:
-    """Take away what /cycle did not have at first."""
-    names = ("cycle", "lateness_ns", "feedback_ns", "command_ns", "overruns", "frames_missing", "commands_late")
-    return replace(run, timing=replace(run.timing, columns={name: run.timing[name] for name in names}))
-
-
 def without_cycles(run: Run) -> Run:
     """Give a log that ended before its first cycle."""
     names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold")

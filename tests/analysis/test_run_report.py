@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hand_made_run import A, M, like_an_old_log, make_run, record, touched_run, without_cycles
+from hand_made_run import A, M, make_run, record, touched_run, without_cycles
 from parsed_page import Page
 
 from adacd_hil.device.value_bounds import ValueBound
@@ -242,13 +242,6 @@ def test_lockstep_times_are_said_to_be_modelled_and_a_run_without_a_reaction_has
     html = tables_of(make_run())
     assert "Lockstep: these are times of the model of bus and host" in html
     assert row_of(html, "Reaction") == ["–"] * 4
-
-
-def test_an_old_log_is_tabled_with_what_it_lacks():
-    html = tables_of(like_an_old_log(touched_run()))
-    lacking = ("Compute", "Slack", "received frames dropped", "receive queue")
-    assert {row_of(html, title)[-1] for title in lacking} == {"not in this log"}
-    assert row_of(html, "Lateness") == ["4.7", "9.3", "9.3", "9.3"]
 
 
 def test_the_page_of_a_log_without_cycles_is_well_formed(tmp_path):

@@ -239,7 +239,6 @@ def origin_table(metrics: Metrics, run: Run, source: ReportSource) -> Table:
     return make_table(("", ""), rows, left=(0, 1))
 
 
-_ABSENT: Final = "not in this log"
 _COUNTS: Final = {
     "overruns": "periods skipped (overruns)",
     "frames_missing": "cyclic frames missing or refused",
@@ -292,8 +291,7 @@ def _time_row(quantity: Quantity, evidence: TimingEvidence, names: Sequence[str]
     label = (quantity.title, quantity.meaning)
     statistics = evidence.times[quantity.name]
     if statistics is None:
-        reason = NONE if evidence.is_modelled and quantity.name == "lateness" else _ABSENT
-        return (label, *[""] * (len(names) - 1), reason)
+        return (label, *[""] * (len(names) - 1), NONE)
     cells: list[object] = [*_values(statistics, names)]
     if quantity.is_reserve and statistics.get("min", 0.0) < 0.0:
         cells[-1] = Cell(cells[-1], "bad")
@@ -308,9 +306,6 @@ def _counts_table(evidence: TimingEvidence) -> Table:
     rows: list[Sequence[object]] = []
     for name, words in _COUNTS.items():
         count = evidence.counts[name]
-        if count is None:
-            rows.append((words, "", _ABSENT))
-            continue
         rows.append((words, Cell(count.total, "bad" if count.total else ""), number_text(count.per_100000, 1)))
     return make_table((f"in {evidence.cycles} cycles", "count", "per 100 000"), rows)
 
@@ -319,18 +314,15 @@ def _queues_table(evidence: TimingEvidence) -> Table:
     rows: list[Sequence[object]] = []
     names = PERCENTILE_NAMES[1], PERCENTILE_NAMES[-1]
     for name, words in _QUEUES.items():
-        depth = evidence.queues_bytes[name]
-        values = ["", _ABSENT] if depth is None else [number_text(depth.get(key), 0) for key in names]
-        rows.append((words, *values))
+        depth = evidence.queues_bytes[name] or {}
+        rows.append((words, *(number_text(depth.get(key), 0) for key in names)))
     return make_table(("bytes", *names), rows)
 
 
 def _ages_table(evidence: TimingEvidence) -> Table:
-    ages = evidence.data_age
-    head = ("age of the oldest value used", "cycles", "share")
-    if ages is None:
-        return make_table(head, [("", "", _ABSENT)])
-    labels = [f"{age}" if age < OLDEST_CYCLES else f"{age} or more" for age in range(len(ages))]
-    shares = zip(labels, ages, strict=True)
-    rows = [(label, str(count), f"{100.0 * count / evidence.cycles:.3f} %") for label, count in shares if count]
-    return make_table(head, rows)
+    rows = [
+        (f"{age}" if age < OLDEST_CYCLES else f"{age} or more", str(count), f"{100.0 * count / evidence.cycles:.3f} %")
+        for age, count in enumerate(evidence.data_age)
+        if count
+    ]
+    return make_table(("age of the oldest value used", "cycles", "share"), rows)

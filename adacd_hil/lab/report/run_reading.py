@@ -415,8 +415,7 @@ class RunReading:
     def _time_curves(self, rows: slice) -> Iterator[NDArray[np.float64]]:
         """Yield the cycles' times, queues and skipped periods in these rows, a curve (n,) each."""
         for name in (*(quantity.column for quantity in QUANTITIES), *QUEUES.values(), "overruns"):
-            if name in self._times.names:
-                yield self._times.column(name)[rows].astype(np.float64)
+            yield self._times.column(name)[rows].astype(np.float64)
 
     def _curves(self, shell: Run, rows: slice) -> Iterator[NDArray[np.float64]]:
         """Yield the curves (n,) that the report draws over /scheme, in these of the kept rows; shell: as of `run`."""

@@ -46,13 +46,13 @@ class Count(NamedTuple):
 
 @dataclass(frozen=True)
 class TimingEvidence:
-    """The times of a run, summed up; None: not in the log, or without a meaning in lockstep.
+    """The times of a run, summed up; None: without a meaning in lockstep.
 
     is_modelled: lockstep, the times are those of the model of bus and host, not of this machine. times: percentiles by
-    name, µs, of each time; histograms: of the same, without those that the log lacks. reaction: percentiles of the
-    latency from the decision to the first command that reacts, µs, and the `count` of reactions. data_age: number of
-    cycles by the age, in cycles, of the oldest value used; the last entry is for OLDEST_CYCLES and more. queues_bytes,
-    counts: by name.
+    name, µs, of each time; histograms: of those that aren't None. reaction: percentiles of the latency from the
+    decision to the first command that reacts, µs, and the `count` of reactions; None without states. data_age: number
+    of cycles by the age, in cycles, of the oldest value used; the last entry is for OLDEST_CYCLES and more.
+    queues_bytes, counts: by name.
     """
 
     period_us: float
@@ -61,9 +61,9 @@ class TimingEvidence:
     times: Mapping[str, Mapping[str, float] | None]
     histograms: Mapping[str, Mapping[str, Any]]
     reaction: Mapping[str, float] | None
-    data_age: tuple[int, ...] | None
+    data_age: tuple[int, ...]
     queues_bytes: Mapping[str, Mapping[str, float] | None]
-    counts: Mapping[str, Count | None]
+    counts: Mapping[str, Count]
 
     def by_key(self) -> dict[str, Any]:
         """Return the evidence by the keys of report.json, such as "times_us"; a missing histogram is None."""

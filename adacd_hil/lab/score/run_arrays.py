@@ -66,7 +66,7 @@ QUANTITIES: Final = (
 
 @dataclass(frozen=True)
 class CycleColumns:
-    """The columns of /cycle over n cycles, int64 (n,). Columns that the log lacks are not in `columns`."""
+    """The columns of /cycle over n cycles, int64 (n,), by the names of `CycleRecord`."""
 
     t_ns: Cycles
     columns: Mapping[str, Cycles]
@@ -77,20 +77,15 @@ class CycleColumns:
     def __getitem__(self, name: str) -> Cycles:
         return self.columns[name]
 
-    def __contains__(self, name: str) -> bool:
-        return name in self.columns
-
     def rows(self, rows: Cycles) -> "CycleColumns":
         """Return the columns of some of the cycles; rows: their indices."""
         return CycleColumns(self.t_ns[rows], {name: column[rows] for name, column in self.columns.items()})
 
-    def times_us(self, quantity: Quantity) -> Vector | None:
-        """Return a time of the cycles that have it, µs (k,); None if the log lacks it.
+    def times_us(self, quantity: Quantity) -> Vector:
+        """Return a time of the cycles that have it, µs (k,).
 
         Cycles with missing frames have no time from SYNC to feedback.
         """
-        if quantity.column not in self:
-            return None
         values_ns = self[quantity.column]
         if quantity.column == "feedback_ns":
             values_ns = values_ns[self["frames_missing"] == 0]  # else it is when the host gave up
@@ -107,9 +102,11 @@ class CycleColumns:
 
 
 def columns_of_series(series: Series) -> CycleColumns:
-    """Return the columns of a log's /cycle; those that an older version lacks are left out."""
-    names = [name for name in CycleRecord._fields if name in series.fields]
-    return CycleColumns(series.t_ns, {name: series[name].astype(np.int64) for name in names})
+    """Return the columns of a log's /cycle. Raises LogError if its records lack one."""
+    lacking = [name for name in CycleRecord._fields if name not in series.fields]
+    if lacking:
+        raise LogError(f"{CYCLE.name} has no {', '.join(lacking)}")
+    return CycleColumns(series.t_ns, {name: series[name].astype(np.int64) for name in CycleRecord._fields})
 
 
 def columns_of_records(t_ns: Sequence[int], records: Sequence[CycleRecord]) -> CycleColumns:

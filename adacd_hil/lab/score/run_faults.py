@@ -106,24 +106,17 @@ class CyclicDataGatherer:
     def add_columns(self, columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
         """Count incomplete and aged data in the next cycles with powered drives, in the order of the run.
 
-        The second under way is kept for the next call. If columns don't number their cycles, only cycles are counted. A
-        kind of data that some columns lack is no longer counted, and unknown in the end. cycle, state: those of /scheme
-        (k,).
+        The second under way is kept for the next call. cycle, state: those of /scheme (k,).
         """
         is_powered = np.isin(state, _POWERED)
         self._cycles += int(np.count_nonzero(is_powered))
-        if "cycle" not in columns:
-            return
         powered = columns.rows(np.flatnonzero(np.isin(columns["cycle"], cycle[is_powered])))
         if not len(powered):
             return
         self._logged += len(powered)
-        for name in [name for name in self._counted if name not in powered]:
-            del self._counted[name]  # an older log does not have it
         for name in self._counted:
             self._counted[name] += int(np.count_nonzero(powered[name]))
-        if "frames_missing" in powered:
-            self._add_windows(np.array([powered["cycle"], powered["frames_missing"] > 0]))
+        self._add_windows(np.array([powered["cycle"], powered["frames_missing"] > 0]))
 
     def _add_windows(self, cycles: Cycles) -> None:
         """Store the worst share so far of incomplete cycles in one second; a gap in the cycle numbers ends a second.
