@@ -53,6 +53,7 @@ def make_run(
     threshold = np.full((count, 2), np.inf)
     threshold[np.isin(states, (M, R, S))] = 0.15
     zeros = np.zeros(count, dtype=np.int64)
+    t_ns = EPOCH_NS + cycle * 1_000_000
     truth = Truth(
         cycle=cycle.copy(),
         tau_ext=np.zeros((count, 2)),
@@ -64,10 +65,11 @@ def make_run(
         model_cycle=cycle,
         model_attempt=zeros,
         force_N=np.zeros(count),
+        time_s=(t_ns - t_ns[states.index(A) if A in states else 0]) * 1e-9,
     )
     run = Run(
         cycle=cycle,
-        t_ns=EPOCH_NS + cycle * 1_000_000,
+        t_ns=t_ns,
         state=np.array(states, dtype=np.uint8),
         fault=np.where(np.array(states) == SchemeState.FAULT, reason, FaultReason.NONE).astype(np.uint8),
         tau_ext_hat=np.zeros((count, 2)),
@@ -75,9 +77,7 @@ def make_run(
         theta_hat=np.zeros((count, 7)),
         threshold=threshold,
         reports=(),
-        timing=CycleColumns(
-            EPOCH_NS + cycle * 1_000_000, {**dict.fromkeys(CycleRecord._fields, zeros), "cycle": cycle}
-        ),
+        timing=CycleColumns(t_ns, {**dict.fromkeys(CycleRecord._fields, zeros), "cycle": cycle}),
         truth=truth if has_truth else None,
         settings=parse(Settings, {"name": "hand-made", "arm": {"cad_theta": list(CAD_THETA)}}),
         metadata={

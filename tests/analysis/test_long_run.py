@@ -155,12 +155,15 @@ def test_what_happens_to_the_arm_after_its_host_has_died_is_none_of_the_host_s()
         contact_link=np.array([0.0, 0.0, 0.0, 2.0, 2.0]),
         contact_index=np.array([-1.0, -1.0, -1.0, 0.0, 0.0]),
         force_N=np.arange(5.0),
+        time_s=np.zeros(5),
         model_attempt=np.zeros(1, np.int64),
         model_cycle=np.array([98]),
         payload_kg=np.zeros(1),
         theta=np.zeros((1, 7)),
     )
-    truth = host_truth(TruthTable(rows, {}, ""), np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5))
+    truth = host_truth(
+        TruthTable(rows, {}, "", ((0, 98), (0, 102))), np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5)
+    )
     assert truth.cycle.tolist() == [98, 99, 100]
     columns = (truth.tau_ext, truth.contact_link, truth.contact_index, truth.force_N, truth.time_s)
     assert [len(column) for column in columns] == [3] * 5
@@ -260,7 +263,8 @@ def scheme_of(cycles, state=SchemeState.MONITOR):
 def truth_at(cycles, attempt=0):
     nothing = np.zeros(len(cycles))
     cycle, attempts = np.array(cycles), np.full(len(cycles), attempt)
-    truth = Truth(cycle, np.zeros((len(cycles), 2)), nothing, nothing, nothing, nothing, attempts, cycle, attempts)
+    torque = np.zeros((len(cycles), 2))
+    truth = Truth(cycle, torque, *[nothing] * 4, attempts, cycle, attempts, nothing, nothing)
     return TruthTable(truth, {}, "")
 
 

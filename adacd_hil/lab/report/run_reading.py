@@ -442,7 +442,7 @@ def _around(run: Run) -> list[Bounds]:
     These are `AROUND_S` around the first `TRACED_CONTACTS` contacts and as many detections, and the first
     `ADAPTATION_S` of the first `ADAPTATIONS` adaptations.
     """
-    onsets_s = [float(each.time_s[0]) for each in timed_contacts(run) if each.time_s is not None]
+    onsets_s = [float(each.time_s[0]) for each in timed_contacts(run)]
     found_s = [(detection.t_ns - run.zero_ns) * 1e-9 for detection in find_detections(run)]
     around = [
         (at_s - AROUND_S[0], at_s + AROUND_S[1]) for at_s in (*onsets_s[:TRACED_CONTACTS], *found_s[:TRACED_CONTACTS])
@@ -476,7 +476,6 @@ class TruthClock:
     """Finds the host's time, `t_ns`, of each row of the truth, as the log is read: interpolated between its cycles."""
 
     def __init__(self, truth: TruthTable) -> None:
-        assert truth.rows.attempt is not None
         self._cycle, self._attempt = truth.rows.cycle, truth.rows.attempt
         self.t_ns = np.zeros(len(self._cycle), np.int64)
         self._pending = np.arange(len(self._cycle))
@@ -641,12 +640,12 @@ def _widened(run: Run, shell: Run, stretch: TimeWindow, start_ns: int) -> tuple[
     for begin_s, end_s in busy:
         if begin_s < last_s < end_s:
             last_s, found = end_s, found._replace(end_s=motion_start_s + end_s)
-    begun_s = [float(each.time_s[0]) for each in timed_contacts(run) if each.time_s is not None]
+    begun_s = [float(each.time_s[0]) for each in timed_contacts(run)]
     if run.truth is None:
         begun_s = [(detection.t_ns - zero_ns) * 1e-9 for detection in find_detections(run)]
     known = StretchOfRun(stretch, found, sum(at_s < first_s for at_s in begun_s), motion_start_s)
     truth = run.truth
-    if truth is not None and truth.time_s is not None:
+    if truth is not None:
         truth = truth_rows(truth, (truth.time_s >= first_s) & (truth.time_s < last_s))
     return replace(shell, motion_start_ns=zero_ns, truth=truth, stretch=known), found.bounds_ns(start_ns)
 
@@ -661,5 +660,4 @@ def _busy(run: Run) -> Iterator[tuple[float, float]]:
         if stay.state in BUSY:
             yield stay.start_s - MARGIN_S, stay.end_s + later_s
     for contact in timed_contacts(run):
-        assert contact.time_s is not None
         yield float(contact.time_s[0]) - MARGIN_S, float(contact.time_s[-1]) + later_s

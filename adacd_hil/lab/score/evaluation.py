@@ -220,12 +220,9 @@ def _contact(
 ) -> ReportedContact:
     """Return a true contact with its delays and peaks, and whether its detection named link and direction rightly.
 
-    The detection's reports are in it, too. detection: None: it was not detected. The run must have the truth, and the
-    contact its `time_s`.
+    The detection's reports are in it, too. detection: None: it was not detected. The run must have the truth.
     """
-    truth, time_s = run.truth, contact.time_s
-    assert truth is not None
-    assert time_s is not None
+    time_s = contact.time_s
     onset_s, touched = float(time_s[0]), slice(contact.rows)
     tau_ext, since_s = contact.tau_ext[touched], time_s[touched] - onset_s
     reported = _reported(run, detection)
@@ -259,7 +256,7 @@ def _contact(
         direction_ok=_is_direction_right(reported.get("direction"), until_final.sum(axis=0)),
         tau_ext_Nm=(float(peak[0]), float(peak[1])),
         torque_error_ratio=_torque_ratio(reported.get("tau_ext_peak_hat_Nm"), peak),
-        true_force_N=None if contact.force_N is None else float(contact.force_N[touched][is_seen].max()),
+        true_force_N=float(contact.force_N[touched][is_seen].max()),
         **reported,
     )
 
@@ -270,7 +267,7 @@ def _touches(run: Run, from_s: float, until_s: float) -> tuple[Vector, Cycles]:
     So a second person who touches the arm meanwhile is included.
     """
     assert run.truth is not None
-    time_s = run.truth_time_s()
+    time_s = run.truth.time_s
     rows = slice(np.searchsorted(time_s, from_s), np.searchsorted(time_s, until_s, side="right"))
     is_touched = run.truth.contact_index[rows] >= 0.0
     return run.truth.tau_ext[rows][is_touched], run.truth.contact_link[rows][is_touched].astype(np.int64)

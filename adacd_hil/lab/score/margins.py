@@ -73,9 +73,7 @@ class BesideGatherer:
         assert stream is not None
         armed = stream.is_armed & ~_parked(time_s, sections, end_s)
         over = armed & (np.abs(stream.tau_ext_hat) > stream.threshold).any(axis=1)
-        is_judged = np.ones(over.size, np.bool_)
-        if outline.truth is not None and outline.truth.span is not None:
-            is_judged = outline.truth.span.covers(piece.cycle)
+        is_judged = np.ones(over.size, np.bool_) if outline.truth is None else outline.truth.span.covers(piece.cycle)
         if outline.finish_cycle is not None:
             is_judged &= piece.cycle < outline.finish_cycle
         since_s = float(time_s[0]) - SETTLING_TIME_CONSTANTS / self._a_rad_s
@@ -107,7 +105,7 @@ class BesideGatherer:
         armed = run.beside.is_armed & ~_parked(time_s, sections, float(time_s[-1]) if time_s.size else 0.0)
         state = np.where(armed, np.uint8(SchemeState.MONITOR), np.uint8(SchemeState.ADAPT))
         threshold = np.full((len(time_s), JOINTS), np.nan)  # the configured one
-        contacts = (each for each in timed_contacts(run) if each.time_s is not None and each.time_s[-1] >= since_s)
+        contacts = (each for each in timed_contacts(run) if each.time_s[-1] >= since_s)
         return placed_in(run, contacts, state, threshold, self._a_rad_s)
 
     def beside(self, run: Run, sections: Sequence[Section]) -> Beside:
@@ -270,10 +268,9 @@ class UntouchedGatherer:
             around = [(found.t_ns - settling_ns, found.t_ns + settling_ns) for found in find_detections(outline)]
         else:
             zero_ns = outline.zero_ns
-            spans_s = [contact.time_s[[0, -1]] for contact in timed_contacts(outline) if contact.time_s is not None]
+            spans_s = [contact.time_s[[0, -1]] for contact in timed_contacts(outline)]
             around = [(zero_ns + round(a * 1e9), zero_ns + round(b * 1e9) + settling_ns) for a, b in spans_s]
-            if truth.span is not None:
-                free &= truth.span.covers(piece.cycle)
+            free &= truth.span.covers(piece.cycle)
         for start_ns, end_ns in around:
             free[np.searchsorted(t_ns, start_ns) : np.searchsorted(t_ns, end_ns, side="right")] = False
         never = np.iinfo(np.int64).min // 2

@@ -285,22 +285,6 @@ class Run:
         # Subtracted as integers: float64 resolves only 256 ns of an absolute time.
         return np.asarray((self.t_ns - self.zero_ns) * 1e-9, dtype=np.float64)
 
-    def time_of_s(self, cycle: NDArray[Any]) -> Vector:
-        """Return the time of any cycle numbers since motion start, s, interpolated between the run's cycles.
-
-        A number before the first or after the last cycle has the time of that cycle. Zeros for a run without cycles.
-        """
-        if self.cycle.size == 0:
-            return np.zeros(len(cycle))
-        return np.asarray(np.interp(cycle, self.cycle, self.time_s()), dtype=np.float64)
-
-    def truth_time_s(self) -> Vector:
-        """Return the time of each row of the truth since motion start, s (k,); empty without the truth."""
-        if self.truth is None:
-            return np.zeros(0)
-        time_s = self.truth.time_s
-        return self.time_of_s(self.truth.cycle) if time_s is None else time_s
-
 
 @dataclass(frozen=True)
 class Section:
@@ -424,7 +408,7 @@ def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> 
     Payloads and parameters after that cycle stay, those of later attempts don't.
     """
     rows = table.rows
-    if not rows.model_cycle.size:
+    if table.span is None:
         return None
     cycle = host_cycles(rows.cycle, rows.attempt, begins)
     of_host = (cycle <= last) & (rows.attempt < len(begins))
@@ -435,7 +419,7 @@ def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> 
         theta=rows.theta[known],
         model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins)[known],
         model_attempt=rows.model_attempt[known],
-        span=None if table.span is None else host_span(table.span, begins),
+        span=host_span(table.span, begins),
     )
 
 
@@ -445,8 +429,7 @@ def truth_rows(truth: Truth, rows: NDArray[np.bool_]) -> Truth:
     rows (m,): a mask.
     """
     names = ("cycle", "tau_ext", "contact_link", "contact_index", "force_N", "time_s", "attempt")
-    columns = {name: getattr(truth, name) for name in names}
-    return replace(truth, **{name: column[rows] for name, column in columns.items() if column is not None})
+    return replace(truth, **{name: getattr(truth, name)[rows] for name in names})
 
 
 def last_cycle(path: Path, scheme: Series, before: tuple[int, int] = (-1, -1)) -> tuple[int, int]:
