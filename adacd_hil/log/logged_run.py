@@ -161,8 +161,8 @@ def begins_alarm(
 ) -> NDArray[np.bool_]:
     """Return for each cycle (n,) whether an alarm begins: a reaction to a contact, not to a host that is late.
 
-    previous, state (n,): before and after the cycle. is_over (n,): a joint is over its threshold, or it is not known
-    whether one is. is_reported (n,): a report of a contact that began in this cycle.
+    previous, state (n,): before and after the cycle. is_over (n,): a joint is over its threshold. is_reported (n,): a
+    report of a contact that began in this cycle.
     """
     return enters_react(previous, state) & np.asarray(is_over | is_reported)
 

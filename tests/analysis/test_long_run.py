@@ -7,7 +7,7 @@ from functools import partialmethod
 import numpy as np
 import pytest
 from called import called
-from hand_made_run import make_certified_run, make_run, react, record, record_truth, touch, with_columns
+from hand_made_run import evaluated, make_certified_run, make_run, react, record, record_truth, touch, with_columns
 
 from adacd_hil.lab.logs.cut import cut
 from adacd_hil.lab.report import run_reading
@@ -179,7 +179,7 @@ def test_a_stretch_has_the_cycles_between_its_times_which_count_from_motion_star
     run = stretched(certified, 2.8, 3.5).run
     assert ((run.t_ns[[0, -1]] - start_ns) * 1e-9).tolist() == pytest.approx([2.8, 3.499])
     assert run.time_s()[0] == pytest.approx(2.75)
-    metrics = evaluate(run)
+    metrics = evaluated(run)
     assert metrics.adaptation_s == {}  # which is no fault of a stretch
     assert not any("adapt" in finding.text for finding in metrics.findings)
 
@@ -213,11 +213,11 @@ def test_the_words_for_a_stretch_name_the_bounds_that_it_has_and_say_whether_it_
 
 
 def test_a_contact_of_a_stretch_is_what_it_is_in_the_whole_log(certified):
-    whole = evaluate(read_run(certified, truth_of(certified)).run).contacts[1]
-    (part,) = evaluate(stretched(certified, 2.9, 4.9).run).contacts
+    whole = evaluated(read_run(certified, truth_of(certified)).run).contacts[1]
+    (part,) = evaluated(stretched(certified, 2.9, 4.9).run).contacts
     assert (part.number, replace(part, section=whole.section)) == (2, whole)
     untold = read_run(certified, None, TimeWindow(2.9, 4.9))
-    assert [contact.number for contact in evaluate(untold.run).contacts] == [2]
+    assert [contact.number for contact in evaluated(untold.run).contacts] == [2]
 
 
 def test_a_cut_says_so_and_names_the_topics_that_it_lacks(certified, tmp_path):
@@ -244,9 +244,9 @@ def test_a_stretch_beside_the_log_is_a_log_error(certified):
 
 
 def test_a_stretch_that_begins_in_the_second_attempt_knows_the_emulators_cycles(log):
-    whole = evaluate(read_run(log, truth_of(log)).run)
+    whole = evaluated(read_run(log, truth_of(log)).run)
     assert whole.fault == FaultReason.DRIVE.name
-    (expected,), (found,) = whole.contacts, evaluate(stretched(log, 4.0, 9.0).run).contacts
+    (expected,), (found,) = whole.contacts, evaluated(stretched(log, 4.0, 9.0).run).contacts
     assert (found.onset_s, found.delay_ms) == (expected.onset_s, expected.delay_ms)
 
 
@@ -304,7 +304,7 @@ def test_the_report_of_a_stretch_says_which_it_is(certified, tmp_path):
 
 
 def test_of_many_contacts_the_first_are_listed_and_those_that_went_wrong(certified):
-    metrics = evaluate(read_run(certified, truth_of(certified)).run)
+    metrics = evaluated(read_run(certified, truth_of(certified)).run)
     right = next(contact for contact in metrics.contacts if contact.direction_ok)
     many = tuple(replace(right, number=number) for number in range(1, 51))
     wrong = replace(right, number=51, link=2, link_detected=1, link_ok=False)
@@ -324,7 +324,7 @@ def test_many_adaptations_are_summed_up():
 
 def test_of_many_stays_those_that_are_narrower_than_a_mark_are_drawn_together():
     stays = [(SchemeState.MONITOR, 3), (SchemeState.REACT, 1)] * 800 + [(SchemeState.MONITOR, 4000)]
-    timeline = timeline_of(run := make_run(*stays), evaluate(run))
+    timeline = timeline_of(run := make_run(*stays), evaluated(run))
     marks = [mark.title for mark in timeline["states"]]
     assert 100 < len(marks) < 650  # 612 fit beside each other
     assert sum(int(mark.split()[0]) for mark in marks if "states" in mark) == 1600

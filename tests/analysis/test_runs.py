@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from called import called
-from hand_made_run import A, M, make_certified_run, make_run, record
+from hand_made_run import A, M, evaluated, make_certified_run, make_run, record
 
 from adacd_hil.file_access import create_file
 from adacd_hil.lab.logs.cut import cut
@@ -32,7 +32,6 @@ from adacd_hil.lab.runs.run_summary import (
     with_devices,
 )
 from adacd_hil.lab.runs.run_trend import trends
-from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.time_window import TimeWindow
@@ -57,7 +56,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = make_run((A, 60), (M, 60))
     record(folder / "run.mcap", run)
     read = read_run(folder / "run.mcap", None)
-    table = report_json(evaluate(read.run), read.run.metadata, read.source)
+    table = report_json(evaluated(read.run), read.run.metadata, read.source)
     (folder / "report.json").write_text(json.dumps(table))
     return folder
 
@@ -144,7 +143,7 @@ def test_a_log_that_is_being_written_is_running(tmp_path):
 
 def test_friction_and_offsets_are_those_of_the_first_certificate_without_payload(one):
     made = make_certified_run()
-    table: dict[str, Any] = report_json(evaluate(made), made.metadata, ReportSource("run.mcap"))
+    table: dict[str, Any] = report_json(evaluated(made), made.metadata, ReportSource("run.mcap"))
     payload = {key: [9.0] * len(values) for key, values in CERTIFICATE.items()}
     table["certified"]["certificates"] = [{**payload, "is_payload": True}, {**CERTIFICATE, "is_payload": False}]
     run = reported(one, "a", table)

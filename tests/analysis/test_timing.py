@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_made_run import A, M, R, S, make_run, with_columns
+from hand_made_run import A, M, R, S, evaluated, make_run, with_columns
 
 from adacd_hil.lab.report.traces import timing_track
-from adacd_hil.lab.score.evaluation import OLDEST_CYCLES, collect_evidence, evaluate, find_reactions
+from adacd_hil.lab.score.evaluation import OLDEST_CYCLES, collect_evidence, find_reactions
 from adacd_hil.lab.score.run_arrays import COMPUTE, CycleColumns, columns_of_series
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import Series
@@ -50,15 +50,15 @@ def test_ages_are_counted_and_the_oldest_together():
 
 
 def test_lockstep_has_no_lateness_and_no_queues():
-    found = evaluate(make_run(clock="lockstep")).timing
+    found = evaluated(make_run(clock="lockstep")).timing
     assert (found.is_modelled, found.times["lateness"], set(found.queues_bytes.values())) == (True, None, {None})
-    assert evaluate(make_run(clock="realtime")).timing.times["lateness"] is not None
+    assert evaluated(make_run(clock="realtime")).timing.times["lateness"] is not None
 
 
 def test_a_reaction_takes_the_compute_time_of_the_cycle_in_which_the_state_becomes_react():
     run = make_run((A, 10), (M, 10), (R, 5), (S, 5), (M, 10), (R, 5))
     run = with_columns(run, compute_ns=1000 * np.arange(45, dtype=np.int64))
-    reaction = evaluate(run).timing.reaction
+    reaction = evaluated(run).timing.reaction
     assert (reaction["count"], reaction["p50"], reaction["max"]) == (2, 40.0, 40.0)
     assert run.timing.times_us(COMPUTE)[find_reactions(run.timing, run.cycle, run.state)].tolist() == [20.0, 40.0]
 

@@ -123,10 +123,10 @@ def _placed(step: NextStep) -> NextStep:
     return step._replace(text=f"{step.text} In the folder of {' and '.join(missing)}:") if missing else step
 
 
-def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: RunGatherer | None = None) -> Report:
+def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: RunGatherer) -> Report:
     """Write the report of a run that is in memory into `out_dir`, over an earlier one; return it.
 
-    gathered: the sums over all cycles; None: the run has all of its cycles. Raises LogError if it can't be written.
+    gathered: the sums over all cycles. Raises LogError if it can't be written.
     """
     metrics = evaluate(run, gathered)
     shown_run = run if has_paper(metrics) else dataclasses.replace(run, beside=None)

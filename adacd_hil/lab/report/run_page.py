@@ -195,7 +195,7 @@ def contact_cards(metrics: Metrics, run: Run) -> list[dict[str, Any]]:
     """Return the cards of the first CARDS contacts: report with uncertainty, truth, and drawing of the arm.
 
     Keys: number; link: the reported one, else the true one; at_s; is_wrong; kind: words; entries: (name, text); arm:
-    drawing or None; stretch_s: from and to which time, s since motion start, the traces of a card show.
+    drawing; stretch_s: from and to which time, s since motion start, the traces of a card show.
     """
     contacts = metrics.contacts[:CARDS]
     strongest_N = max((abs(contact.force_N) for contact in contacts if contact.force_N is not None), default=0.0)
@@ -287,13 +287,8 @@ def _torques(contact: ReportedContact) -> list[tuple[str, str]]:
     return entries
 
 
-def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> dict[str, Any] | None:
-    """Return a drawing of the arm when a contact was found, or, if it was missed, when it began.
-
-    None without measured positions.
-    """
-    if run.motion is None:
-        return None
+def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> dict[str, Any]:
+    """Return a drawing of the arm when a contact was found, or, if it was missed, when it began."""
     at_s = contact.at_s if contact.detected_s is None else contact.detected_s
     q: Vector = run.motion.q[row_at(run, at_s)]
     push = _push(contact, strongest_N, run.settings.arm.link_length_m[0])

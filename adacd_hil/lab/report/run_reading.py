@@ -164,6 +164,8 @@ def _shell(stream: LogStream, truth: TruthTable | None) -> Run:
         metadata=metadata,
         frames=None,
         dropped=None,
+        contact_joints=np.empty(0, np.uint8),
+        motion=MeasuredMotion(nothing, nothing, nothing),
         log_start_ns=start_of_log(stream.path),
     )
 
@@ -278,7 +280,7 @@ class RunReading:
         self._events: list[LoggedEvent] = []
         self._checks: list[CheckCounts] = []
         self._finish_cycle: int | None = None  # of the first request to finish
-        self._zero_ns = shell.motion_start_ns
+        self._zero_ns = None if shell.stretch is None else shell.zero_ns
         self._first_ns: int | None = None
         self._last_cycle = -1
 
@@ -383,7 +385,7 @@ class RunReading:
             events=tuple(self._events),
             finish_cycle=self._finish_cycle,
             checks=_joined(self._checks),
-            motion_start_ns=zero_ns,
+            zero_ns=zero_ns,
         )
         if self._truth is None or self._clock is None:
             return run
@@ -393,7 +395,7 @@ class RunReading:
     def _settle(self, end: int) -> None:
         """Add the kept rows before `end` to `sums`, each once. Of a long run, drop then those that are not drawn."""
         outline = self.outline()
-        shell = replace(self._shell, truth=None, motion_start_ns=outline.motion_start_ns)
+        shell = replace(self._shell, truth=None, zero_ns=outline.zero_ns)
         self.sums.untouched.add_untouched(self._rows.run(shell, slice(self._settled, end)), outline)
         first, cycles = self._settled, self._rows.cycles
         self._settled = end
@@ -647,7 +649,7 @@ def _widened(run: Run, shell: Run, stretch: TimeWindow, start_ns: int) -> tuple[
     truth = run.truth
     if truth is not None:
         truth = truth_rows(truth, (truth.time_s >= first_s) & (truth.time_s < last_s))
-    return replace(shell, motion_start_ns=zero_ns, truth=truth, stretch=known), found.bounds_ns(start_ns)
+    return replace(shell, zero_ns=zero_ns, truth=truth, stretch=known), found.bounds_ns(start_ns)
 
 
 def _busy(run: Run) -> Iterator[tuple[float, float]]:

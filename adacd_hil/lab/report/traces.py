@@ -94,8 +94,6 @@ def panels_of(run: Run) -> tuple[TracePanel, ...]:
 
 
 def _motion(run: Run) -> Iterator[TracePanel]:
-    if run.motion is None:
-        return
     for name, title, unit in (
         ("q", "Measured position q", "rad"),
         ("dq", "Measured velocity dq", "rad/s"),

@@ -30,7 +30,6 @@ from adacd_hil.lab.score.run_arrays import (
     Quantity,
     Run,
     Section,
-    is_realtime,
     section_at,
     split_sections,
 )
@@ -76,15 +75,8 @@ class RunGatherer:
             self._state = int(state[-1])
 
 
-def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
-    """Return all metrics of a run.
-
-    gathered: the sums over all cycles; None: they are formed from the run, which must then have all of its cycles.
-    """
-    if gathered is None:
-        gathered = RunGatherer(run.settings, not is_realtime(run))
-        gathered.add_times(run.timing, run.cycle, run.state)
-        gathered.untouched.add_untouched(run, run)
+def evaluate(run: Run, gathered: RunGatherer) -> Metrics:
+    """Return all metrics of a run; gathered: the sums over all cycles."""
     timing, data = gathered.timing.evidence(), gathered.data.data(run)
     detections = find_detections(run)
     score = judge_run(run, contacts_of(run), detections)

@@ -208,7 +208,8 @@ class Run:
     """A run as plain arrays over n of its cycles: over all, or of a long one over those that the report keeps.
 
     Joint arrays are (n, 2), theta_hat (n, p). `truth` is None on a real arm. frames, dropped: counts of the log's
-    summary, None if it lacks them.
+    summary, None if it lacks them. zero_ns: motion start, the first cycle in ADAPT, else the first cycle; 0 without
+    cycles.
     """
 
     cycle: Cycles
@@ -226,13 +227,13 @@ class Run:
     metadata: Mapping[str, str]
     frames: int | None
     dropped: int | None
+    contact_joints: NDArray[np.uint8]  # bit i: joint i is over its threshold
+    motion: MeasuredMotion
+    zero_ns: int = 0
     finish_cycle: int | None = None  # cycle of the request to finish; None: never
-    contact_joints: NDArray[np.uint8] | None = None  # bit i: joint i is over its threshold
     certified: CertifiedStream | None = None  # None of the paper's scheme
     beside: PaperStream | None = None
-    motion: MeasuredMotion | None = None
     events: tuple[LoggedEvent, ...] = ()
-    motion_start_ns: int | None = None  # None: the first cycle in ADAPT, else the first cycle
     all_cycles: int | None = None  # of a long run: how many there are, of which the n are kept
     bucket: int = 1  # of a long run: of so many cycles those with extremes are kept
     log_start_ns: int | None = None  # the beginning of its log
@@ -266,19 +267,6 @@ class Run:
         """Cut-off of the filter of `tau_ext_hat`, rad/s: the slowest of the certified scheme's bank, or the paper's."""
         is_certified = self.certified is not None
         return self.settings.certified.cutoffs_rad_s[0] if is_certified else self.settings.filter.a_rad_s
-
-    @property
-    def zero_ns(self) -> int:
-        """Motion start, ns of the run's clock: `motion_start_ns` if that is set, else the first cycle in ADAPT.
-
-        Without one it is the first cycle; 0 for a run without cycles.
-        """
-        if self.motion_start_ns is not None:
-            return self.motion_start_ns
-        if self.t_ns.size == 0:
-            return 0
-        adapting = self.state == SchemeState.ADAPT
-        return int(self.t_ns[int(np.argmax(adapting)) if adapting.any() else 0])
 
     def time_s(self) -> Vector:
         """Return the time of each cycle since motion start, s (n,)."""

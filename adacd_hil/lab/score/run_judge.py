@@ -24,9 +24,8 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
     alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
     finals = {report.cycle: report for report in run.reports if report.is_final}
     detections = []
-    is_over = np.ones(run.state.size, np.bool_) if run.contact_joints is None else run.contact_joints != 0
     is_reported = np.isin(run.cycle, [*alarms, *finals])
-    begins = begins_alarm(run.state[:-1], run.state[1:], is_over[1:], is_reported[1:])
+    begins = begins_alarm(run.state[:-1], run.state[1:], run.contact_joints[1:] != 0, is_reported[1:])
     for row in (np.flatnonzero(begins) + 1).tolist():
         cycle = int(run.cycle[row])
         final = finals.get(cycle)
