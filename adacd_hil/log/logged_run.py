@@ -96,8 +96,10 @@ Mask = NDArray[np.bool_]
 class Truth:
     """The emulator's truth in some of its cycles (m,): external torque (m, 2), Nm, and the contact.
 
-    contact_link, contact_index: of the contact in a cycle; attempt: of each cycle, from 0. Of a long run it has the
-    cycles of contacts and the one after each. payload_kg (k,), theta (k, 7): with the cycles from which on they hold.
+    contact_link, contact_index: of the contact in a cycle, force_N: its size; attempt: of each cycle, from 0; time_s: s
+    since motion start, 0 until the truth is on the host's cycles. Of a long run it has the cycles of contacts and the
+    one after each. payload_kg (k,), theta (k, 7): with the cycles from which on they hold. span: cycles that the
+    emulator recorded, whichever are kept.
     """
 
     cycle: Cycles
@@ -109,14 +111,13 @@ class Truth:
     attempt: Cycles
     model_cycle: Cycles
     model_attempt: Cycles
-    force_N: Vector | None = None  # size of the contact force (m,); None: of an older emulator
-    time_s: Vector | None = None  # of its cycles (m,), since motion start; None: between those of the run
-    span: Span | None = None
-    """Cycles that the emulator recorded, whichever are kept; None: all."""
+    force_N: Vector
+    time_s: Vector
+    span: Span = Span(0, _NEVER)
 
     def covers(self, cycle: int) -> bool:
-        """Return whether the emulator recorded a cycle of the host; True without a span."""
-        return self.span is None or bool(self.span.covers(np.array(cycle)))
+        """Return whether the emulator recorded a cycle of the host."""
+        return bool(self.span.covers(np.array(cycle)))
 
     def model_row(self, cycle: int) -> int | None:
         """Return the index, in `payload_kg` and `theta`, of the values that hold in a cycle, in the truth's own count.
@@ -160,8 +161,8 @@ def begins_alarm(
 ) -> NDArray[np.bool_]:
     """Return for each cycle (n,) whether an alarm begins: a reaction to a contact, not to a host that is late.
 
-    previous, state (n,): before and after the cycle. is_over (n,): a joint is over its threshold, or it is not known
-    whether one is. is_reported (n,): a report of a contact that began in this cycle.
+    previous, state (n,): before and after the cycle. is_over (n,): a joint is over its threshold. is_reported (n,): a
+    report of a contact that began in this cycle.
     """
     return enters_react(previous, state) & np.asarray(is_over | is_reported)
 

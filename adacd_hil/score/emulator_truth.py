@@ -94,7 +94,6 @@ class _TruthRows:
     """Keeps rows of /truth, piece by piece: of one contact in progress in bounded memory."""
 
     def __init__(self) -> None:
-        self._has_force = True
         self._kept: list[NDArray[Any]] = []
         self._kept_rows = 0
         self._first: NDArray[Any] | None = None
@@ -134,7 +133,6 @@ class _TruthRows:
         for name in _ROW.names or ():
             if name in truth.fields:
                 rows[name] = records[name].reshape(rows[name].shape)
-        self._has_force = self._has_force and "contact_force" in truth.fields
         before = rows[:1] if self._last is None else self._last
         is_anew = np.diff(rows["cycle"], prepend=before["cycle"]) < 0
         rows["attempt"] = before["attempt"] + np.cumsum(is_anew)
@@ -202,7 +200,8 @@ class _TruthRows:
             contact_index=rows["contact_index"].copy(),
             payload_kg=payload[:, 0],
             theta=theta,
-            force_N=rows["contact_force"].copy() if self._has_force else None,
+            force_N=rows["contact_force"].copy(),
+            time_s=np.zeros(len(rows)),
             attempt=rows["attempt"].copy(),
             model_cycle=cycle,
             model_attempt=attempt,

@@ -81,8 +81,8 @@ class TrueContact:
     rows: int = 0
     cycle: Times = field(default_factory=lambda: np.zeros(0, np.int64), compare=False, repr=False)
     tau_ext: Vector = field(default_factory=lambda: np.zeros((0, JOINTS)), compare=False, repr=False)
-    force_N: Vector | None = field(default=None, compare=False, repr=False)
-    time_s: Vector | None = field(default=None, compare=False, repr=False)
+    force_N: Vector = field(default_factory=lambda: np.zeros(0), compare=False, repr=False)
+    time_s: Vector = field(default_factory=lambda: np.zeros(0), compare=False, repr=False)
 
     @property
     def onset(self) -> int:
@@ -309,8 +309,8 @@ def true_contacts(truth: Truth | None, first_number: int = 1) -> tuple[TrueConta
                 rows=end - start,
                 cycle=truth.cycle[rows],
                 tau_ext=truth.tau_ext[rows],
-                force_N=None if truth.force_N is None else truth.force_N[rows],
-                time_s=None if truth.time_s is None else truth.time_s[rows],
+                force_N=truth.force_N[rows],
+                time_s=truth.time_s[rows],
             )
         )
     return tuple(found)

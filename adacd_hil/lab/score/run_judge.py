@@ -6,7 +6,6 @@ Shapes and units as in `adacd_hil.lab.score.run_arrays`.
 import math
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +24,8 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
     alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
     finals = {report.cycle: report for report in run.reports if report.is_final}
     detections = []
-    is_over = np.ones(run.state.size, np.bool_) if run.contact_joints is None else run.contact_joints != 0
     is_reported = np.isin(run.cycle, [*alarms, *finals])
-    begins = begins_alarm(run.state[:-1], run.state[1:], is_over[1:], is_reported[1:])
+    begins = begins_alarm(run.state[:-1], run.state[1:], run.contact_joints[1:] != 0, is_reported[1:])
     for row in (np.flatnonzero(begins) + 1).tolist():
         cycle = int(run.cycle[row])
         final = finals.get(cycle)
@@ -41,22 +39,17 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
 def uncovered_watch(run: Run) -> Mask:
     """Return for each cycle (n,) whether it is in MONITOR and not covered by the truth.
 
-    All False without a truth, or if the truth has no `span`.
+    All False without a truth.
     """
     watched = is_armed_in(run.state)
-    if run.truth is None or run.truth.span is None:
+    if run.truth is None:
         return np.zeros_like(watched)
     return np.asarray(watched & ~run.truth.span.covers(run.cycle))
 
 
 def timed_contacts(run: Run) -> tuple[TrueContact, ...]:
-    """Return the true contacts of a run, with the times of their rows; () without the truth or cycles."""
-    truth = run.truth
-    if truth is None or run.cycle.size == 0:
-        return ()
-    if truth.time_s is None:
-        truth = replace(truth, time_s=run.time_of_s(truth.cycle))
-    return true_contacts(truth, run.first_contact)
+    """Return the true contacts of a run, with the times of their rows; () without the truth."""
+    return true_contacts(run.truth, run.first_contact)
 
 
 def contacts_of(run: Run) -> tuple[TrueContact, ...]:
@@ -74,7 +67,6 @@ def placed_in(
     host = HostCycles(run.cycle, run.t_ns, np.concatenate(([SchemeState.INIT], state[:-1])), threshold)
     placed = []
     for contact in contacts:
-        assert contact.time_s is not None
         onset_ns, end_ns = (run.zero_ns + round(float(at_s) * 1e9) for at_s in contact.time_s[[0, -1]])
         row = row_at(run, float(contact.time_s[0]))
         placed.append(placed_contact(contact, (onset_ns, end_ns), host, row, run.settings, a_rad_s))
