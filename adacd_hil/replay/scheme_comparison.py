@@ -28,6 +28,7 @@ from adacd_hil.log.types.topics import ARM, CONTACT, EVENTS, SCHEME
 from adacd_hil.records import JOINTS, ArmBatch, ContactReport, Event, Layout, Request, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.scheme.supervisor.kept_request import KeptRequest
+from adacd_hil.scheme.supervisor.supervisor import POWERED, among
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.run_settings import OperatorSettings
 
@@ -332,7 +333,7 @@ class Asking:
         """
         self._kept.ask(request, previous)
         self._kept.serve((state,))
-        if state is SchemeState.ADAPT and self._enabled is None:
+        if state in POWERED and self._enabled is None:
             self._enabled = cycle
 
     def requests(self, ticks: Ticks, batch: SchemeBatch) -> NDArray[np.uint8]:
@@ -343,7 +344,7 @@ class Asking:
         """
         asked = np.zeros(len(ticks.cycle), np.uint8)
         if self._enabled is None:
-            enabled = np.flatnonzero(batch.state == SchemeState.ADAPT)
+            enabled = np.flatnonzero(among(POWERED)[batch.state])
             if enabled.size == 0:
                 return asked
             self._enabled = int(ticks.cycle[enabled[0]])
