@@ -129,7 +129,7 @@ class _Player:
         self.gatherer.add_stretch(ticks, batch, stretch.follows_gap)
         asked = None
         if self._asking is not None and stretch.requests is not None and stretch.is_exact:
-            asked = self._asking.requests(ticks, batch)
+            asked = self._asking.requests(ticks, batch, stretch.requests)
         if is_told:
             self.cycles += len(ticks.cycle)
             monitored = ticks.cycle[is_armed_in(batch.state)]

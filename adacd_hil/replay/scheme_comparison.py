@@ -336,11 +336,12 @@ class Asking:
         if state in POWERED and self._enabled is None:
             self._enabled = cycle
 
-    def requests(self, ticks: Ticks, batch: SchemeBatch) -> NDArray[np.uint8]:
+    def requests(self, ticks: Ticks, batch: SchemeBatch, logged: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the user's requests in a stretch (n,), as `ask` does, given the scheme's states in it.
 
-        NONE until the drives are enabled. Keep a request to finish or to change the payload for the next attempt if the
-        scheme hasn't served it. Call it for all stretches of an attempt, in the order of time.
+        NONE until the drives are enabled, and where a logged request (n,) is of the host's own checks: it asks no user
+        then. Keep a request to finish or to change the payload for the next attempt if the scheme hasn't served it.
+        Call it for all stretches of an attempt, in the order of time.
         """
         asked = np.zeros(len(ticks.cycle), np.uint8)
         if self._enabled is None:
@@ -352,7 +353,7 @@ class Asking:
         else:
             first = 0
         served = 0
-        for row in self._rows(ticks, batch, first):
+        for row in self._rows(ticks, batch, np.isin(logged, _OWN_CHECKS), first):
             self._kept.serve(batch.state[served:row])
             served = row
             previous = SchemeState(batch.previous_state[row])
@@ -361,10 +362,11 @@ class Asking:
         self._kept.serve(batch.state[served:])
         return asked
 
-    def _rows(self, ticks: Ticks, batch: SchemeBatch, first: int) -> list[int]:
+    def _rows(self, ticks: Ticks, batch: SchemeBatch, is_own: NDArray[np.bool_], first: int) -> list[int]:
         """Return the indices of the cycles from `first` on in which the script could make a request.
 
         Also those in which its wait begins anew, and `first`: a request left by the attempt before may be made in it.
+        In place of a cycle in which the host's own checks request (is_own) the one after it.
         """
         assert self._enabled is not None
         is_due = np.zeros(len(ticks.cycle), np.bool_)
@@ -374,7 +376,8 @@ class Asking:
             is_due |= is_stopped | np.concatenate(([self._was_stopped], is_stopped[:-1]))
             self._was_stopped = bool(is_stopped[-1])
         elapsed_s = (ticks.cycle - self._enabled) * self._period_s
-        is_alive = batch.previous_state != SchemeState.FAULT
+        is_alive = ~is_own & (batch.previous_state != SchemeState.FAULT)
         for at_s in self._times_s:  # as many cycles as others may be due before it, one each
             is_due[np.flatnonzero((elapsed_s >= at_s) & is_alive)[: len(self._times_s) + 1]] = True
-        return [row for row in np.flatnonzero(is_due).tolist() if row >= first]
+        is_due[1:] |= is_own[:-1]
+        return [row for row in np.flatnonzero(is_due & ~is_own).tolist() if row >= first]
