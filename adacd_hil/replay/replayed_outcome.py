@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.logged_run import Mismatch, begins_alarm, host_span, is_armed_in
+from adacd_hil.log.logged_run import Mismatch, begins_alarm, host_span, is_armed_in, last_armed
 from adacd_hil.records import JOINTS, LEARNING, PARAMETER_UNITS, ContactReport, FaultReason, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.score.emulator_truth import HostCycles, KnownContacts, placed_contacts
-from adacd_hil.score.judge import Detection, Score, TrueContact, judge
+from adacd_hil.score.judge import Detection, Score, TrueContact, is_about_weight, judge
 from adacd_hil.score.smallest_push import PUSH_WITHIN, PushGatherer
 from adacd_hil.score.wording import NONE, found_text, why_not_found
 from adacd_hil.settings.configuration import Settings
@@ -35,6 +35,14 @@ class StateChange(NamedTuple):
     previous: SchemeState
     state: SchemeState
     fault: FaultReason
+
+
+class _Moment(NamedTuple):
+    """The cycle of an alarm, the state before it, and the last cycle in MONITOR before it, -1: there is none."""
+
+    cycle: int
+    before: int
+    armed: int
 
 
 class OutcomeGatherer:
@@ -53,7 +61,8 @@ class OutcomeGatherer:
         self._contacts: list[TrueContact] = []  # of this attempt, on the host's cycles
         self._kept: list[HostCycles] = []  # of this attempt
         self._placed: list[TrueContact] = []  # on the host's clock
-        self._alarms: list[tuple[int, Detection]] = []  # with the cycle of each
+        self._alarms: list[tuple[Detection, _Moment]] = []
+        self._armed = -1  # last cycle in MONITOR
         self.behind_gap_ns: set[int] = set()
         """Times of the alarms before which the log lacks cycles of their attempt."""
         self._begins: list[int] = []  # first cycle of each attempt
@@ -86,9 +95,12 @@ class OutcomeGatherer:
         is_reported[batch.contact_places] = [report.cycle for report in batch.contacts] == ticks.cycle[
             batch.contact_places
         ]
+        armed = last_armed(ticks.cycle, batch.state, self._armed)
+        self._armed = int(armed[-1])
         for row in np.flatnonzero(begins_alarm(batch.previous_state, batch.state, over, is_reported)).tolist():
+            moment = _Moment(int(ticks.cycle[row]), int(batch.previous_state[row]), int(armed[row]))
             is_armed = bool(is_armed_in(batch.previous_state[row]))
-            self._alarms.append((int(ticks.cycle[row]), Detection(int(ticks.t_ns[row]), is_armed)))
+            self._alarms.append((Detection(int(ticks.t_ns[row]), is_armed), moment))
             if follows_gap:
                 self.behind_gap_ns.add(int(ticks.t_ns[row]))
         for row in np.flatnonzero(batch.state != batch.previous_state).tolist():
@@ -173,7 +185,7 @@ class OutcomeGatherer:
         self.end_attempt()
         self._begins += [cycle] * (attempt + 1 - len(self._begins))  # also of those that a recording lacks
         if self._truth is not None:
-            mine = (contact for contact in self._truth[0] if contact.attempt == attempt)
+            mine = (contact for contact in self._truth.contacts if contact.attempt == attempt)
             self._contacts = [contact.counted_from(cycle) for contact in mine]
         self._was_over = False
 
@@ -191,13 +203,13 @@ class OutcomeGatherer:
     @property
     def detections_ns(self) -> list[int]:
         """Times of all alarms, ns, the ones behind gaps included."""
-        return [alarm.t_ns for _, alarm in self._alarms]
+        return [alarm.t_ns for alarm, _ in self._alarms]
 
     def uncovered(self, cycle: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return for each cycle (n,) of the attempts so far whether the truth lacks it; all False without a truth."""
         if self._truth is None:
             return np.zeros(len(cycle), np.bool_)
-        return ~host_span(self._truth[1], np.array(self._begins or [0])).covers(cycle)
+        return ~host_span(self._truth.span, np.array(self._begins or [0])).covers(cycle)
 
     def score(self) -> Score | None:
         """Return which true contacts were detected and which alarms were false; None if the truth is not known.
@@ -206,10 +218,15 @@ class OutcomeGatherer:
         """
         if self._truth is None:
             return None
-        is_known = (~self.uncovered(np.array([cycle for cycle, _ in self._alarms], np.int64))).tolist()
+        is_known = (~self.uncovered(np.array([moment.cycle for _, moment in self._alarms], np.int64))).tolist()
+        rows = self._truth.rows.with_host_models(np.array(self._begins or [0]))
         alarms = [
-            replace(alarm, is_known=known and alarm.t_ns not in self.behind_gap_ns)
-            for (_, alarm), known in zip(self._alarms, is_known, strict=True)
+            replace(
+                alarm,
+                is_known=known and alarm.t_ns not in self.behind_gap_ns,
+                is_weight=is_about_weight(rows, self._settings, *moment),
+            )
+            for (alarm, moment), known in zip(self._alarms, is_known, strict=True)
         ]
         return judge(self._placed, alarms, self._crossings)
 

@@ -288,23 +288,24 @@ def test_other_settings_decide_otherwise_about_the_same_motion(log):
 
 def test_what_comes_before_or_after_the_truth_is_not_judged(log, whole):
     """As in the report: a detection there is neither right nor a false alarm, and a replay says that there are some."""
-    source, (contacts, span) = LogSource(log), contacts_beside(log)
-    attempt, onset = contacts[0].attempt, contacts[0].onset
-    first, last = span
+    source, truth = LogSource(log), contacts_beside(log)
+    attempt, onset = truth.contacts[0].attempt, truth.contacts[0].onset
+    first, last = truth.span
     assert first < (attempt, onset) < last
 
     def judged(*known: tuple[int, int]) -> tuple[int, bool, tuple[str, ...]]:
-        found = replay_source(LogSource(log), [source.settings], ((), known))[0]
+        found = replay_source(LogSource(log), [source.settings], truth._replace(contacts=(), span=known))[0]
         return len(found.score.false_alarms), found.is_whole, found.notes
 
     said = "the truth doesn't cover 1 detection, not judged"
     assert judged(first, last) == (1, True, ())
     assert judged(first, (attempt, onset - 1)) == (0, False, (said,))
     assert judged(last, last) == (0, False, (said,))
-    found = replay_source(LogSource(log), [source.settings], ((), (first, (last[0], last[1] - 100))))[0]
+    shorter = truth._replace(contacts=(), span=(first, (last[0], last[1] - 100)))
+    found = replay_source(LogSource(log), [source.settings], shorter)[0]
     assert [note.partition(" s of MONITOR")[0] for note in found.notes] == ["the truth doesn't cover 0.08"]
     assert judged(first, (whole.attempts, 0)) == (1, True, ())  # it goes on with the next host
-    assert replay_source(LogSource(log), [source.settings], (contacts, span))[0].notes == ()
+    assert replay_source(LogSource(log), [source.settings], truth)[0].notes == ()
 
 
 def test_a_truth_of_another_run_is_noted_by_each_replay(log, tmp_path):
