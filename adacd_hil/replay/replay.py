@@ -26,10 +26,9 @@ from adacd_hil.log.log_files import SCRIPTED, SHOWN, LogError
 from adacd_hil.log.logged_run import Milestones, Mismatch, Progress, is_armed_in
 from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
-from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
+from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeState
 from adacd_hil.replay.can_recording import RecordingAlone
 from adacd_hil.replay.log_source import CycleStretch, LogSource, Part
-from adacd_hil.replay.logged_arms import arm_at
 from adacd_hil.replay.replayed_outcome import OutcomeGatherer, Replay
 from adacd_hil.replay.scheme_comparison import (
     TOLERANCE,
@@ -111,7 +110,6 @@ class _Player:
         self._asking = asking
         self._checks_arms = checks_arms
         self._pipeline: Pipeline  # of the attempt, with which the first stretch begins
-        self._state: SchemeState
         self._reports: dict[int, ContactReport] = {}  # of this part, by time
         self._cycles: dict[int, int] = {}
 
@@ -172,7 +170,6 @@ class _Player:
     def _begin(self) -> None:
         """Begin an attempt: a new pipeline in INIT, and a new attempt of the script."""
         self._pipeline = new_pipeline(self.settings)
-        self._state = SchemeState.INIT
         self.attempts += 1
         if self._asking is not None:
             self._asking.begin_attempt()
@@ -180,19 +177,18 @@ class _Player:
     def _run(self, stretch: CycleStretch, arms: ArmBatch) -> SchemeBatch:
         """Run the scheme on a stretch and return its decisions, with the logged requests.
 
-        If the requests are unknown, the script makes them, or without a script there are none.
+        If the requests are unknown, the script makes them, cycle by cycle.
         """
         if stretch.requests is not None:
             return self._pipeline.run(arms, _known(stretch.requests))
-        outputs = []
+        assert self._asking is not None
+        batches = []
         for row, cycle in enumerate(stretch.ticks.cycle.tolist()):
-            request = Request.NONE if self._asking is None else self._asking.ask(cycle, self._state)
-            output = self._pipeline.step(arm_at(arms, row), request)
-            if self._asking is not None:
-                self._asking.note_request(cycle, request, self._state, output.state)
-            self._state = output.state
-            outputs.append(output)
-        return _columns(outputs)
+            before = self._pipeline.state
+            request = self._asking.ask(cycle, before)
+            batches.append(self._pipeline.run(_arms_of(arms, slice(row, row + 1)), np.array([request], np.uint8)))
+            self._asking.note_request(cycle, request, before, self._pipeline.state)
+        return _joined(batches)
 
     def compare_contacts(self, logged: Mapping[int, Mapping[str, Any]], exact: Sequence[tuple[int, int]]) -> None:
         """Compare a part's contact reports with the logged ones, then forget them.
@@ -206,19 +202,14 @@ class _Player:
         self._reports, self._cycles = {}, {}
 
 
-def _columns(outputs: Sequence[SchemeOutput]) -> SchemeBatch:
-    """Return the outputs of single cycles as one batch of arrays, with a list of the contacts' reports."""
-    states = (("state", np.uint8), ("previous_state", np.uint8), ("fault", np.uint8), ("reaction", np.uint8))
-    wholes = (("cycle", np.int64), ("contact_joints", np.int64), ("is_model_valid", np.bool_), *states)
-    columns: dict[str, Any] = {
-        name: np.array([getattr(output, name) for output in outputs], kind) for name, kind in wholes
-    }
-    contacts = {row: output.contact for row, output in enumerate(outputs) if output.contact is not None}
+def _joined(batches: Sequence[SchemeBatch]) -> SchemeBatch:
+    """Return batches of one cycle each as one."""
+    names = set(SchemeBatch._fields) - {"contacts", "contact_places"}
+    columns: dict[str, Any] = {name: np.concatenate([getattr(batch, name) for batch in batches]) for name in names}
     return SchemeBatch(
         **columns,
-        block=np.array([output.block for output in outputs]),
-        contacts=list(contacts.values()),
-        contact_places=np.array(list(contacts), np.int64),
+        contacts=[report for batch in batches for report in batch.contacts],
+        contact_places=np.flatnonzero([len(batch.contacts) for batch in batches]),
     )
 
 
@@ -239,10 +230,10 @@ def replay_source(
 
     Only settings equal to the source's are compared with the log. truth: the true contacts, None if unknown; remarks:
     on it, for the notes of each replay. progress: prints a line about the work. tolerance: of the comparison; None:
-    exact, or `TOLERANCE` where the log's numbers were computed on another kind of machine. script_of: as for `replay`.
-    stretch: the part that is compared and reported; watch sees all from the beginning of the log on. by_frames: decode
-    the frames and compare each state with the log's. Raises LogError if the source can't be read, or no cycle of the
-    stretch can be replayed; ConfigError if a device can't be loaded.
+    exact, or `TOLERANCE` where the log's numbers were computed on another kind of machine. script_of: as for `replay`;
+    a recording without a log needs it. stretch: the part that is compared and reported; watch sees all from the
+    beginning of the log on. by_frames: decode the frames and compare each state with the log's. Raises LogError if the
+    source can't be read, or no cycle of the stretch can be replayed; ConfigError if a device can't be loaded.
     """
     bounds_ns = EVER_NS if stretch.is_whole else stretch.bounds_ns(source.start_ns)
     if tolerance is None:
