@@ -210,5 +210,4 @@ class Mismatch(NamedTuple):
     def line(self, zero_ns: int = 0) -> str:
         """Return the mismatch as one line, with the time in s since `zero_ns`."""
         time_s = (self.t_ns - zero_ns) * 1e-9
-        cycle = f"cycle {self.cycle}, " if self.cycle >= 0 else ""
-        return f"{cycle}{time_s:.6f} s: {self.name} = {self.logged} logged, {self.replayed} here"
+        return f"cycle {self.cycle}, {time_s:.6f} s: {self.name} = {self.logged} logged, {self.replayed} here"

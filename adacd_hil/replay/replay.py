@@ -12,7 +12,7 @@ A replay of a stretch begins with the log too, because the state of filters and 
 ends with the stretch, and compares and reports only the cycles in it.
 """
 
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -26,7 +26,7 @@ from adacd_hil.log.log_files import SCRIPTED, SHOWN, LogError
 from adacd_hil.log.logged_run import Milestones, Mismatch, Progress, is_armed_in
 from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
-from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeState
+from adacd_hil.records import ArmBatch, Event, Request, SchemeState
 from adacd_hil.replay.can_recording import RecordingAlone
 from adacd_hil.replay.log_source import CycleStretch, LogSource, Part
 from adacd_hil.replay.replayed_outcome import OutcomeGatherer, Replay
@@ -110,8 +110,6 @@ class _Player:
         self._asking = asking
         self._checks_arms = checks_arms
         self._pipeline: Pipeline  # of the attempt, with which the first stretch begins
-        self._reports: dict[int, ContactReport] = {}  # of this part, by time
-        self._cycles: dict[int, int] = {}
 
     def play(self, stretch: CycleStretch, arms: ArmBatch, part: Part, is_told: bool) -> SchemeBatch:
         """Run the scheme on the cycles of `stretch`, in piece `part` of the log; gather and return its decisions.
@@ -145,11 +143,11 @@ class _Player:
         part: Part,
         events: Sequence[Event],
     ) -> None:
-        """Compare the decisions about a stretch's cycles with the log, and the requests and events in them.
+        """Compare the decisions about a stretch's cycles with the log, and the requests, reports and events in them.
 
-        Compare states that were decoded from frames, too. Keep the contacts' reports for `compare_contacts`. Do nothing
-        if this variant isn't compared, or the log lacks its decisions, requests, or earlier cycles of the attempt.
-        asked: requests of the script (n,); None: each logged one that is a Request is believed.
+        Compare states that were decoded from frames, too. Do nothing if this variant isn't compared, or the log lacks
+        its decisions, requests, or earlier cycles of the attempt. asked: requests of the script (n,); None: each logged
+        one that is a Request is believed.
         """
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
             return
@@ -160,10 +158,10 @@ class _Player:
         if asked is None:  # whatever a user could ask is believed
             asked = _known(stretch.requests)
         self.comparison.compare_requests(ticks, stretch.requests, asked)
-        times = ticks.t_ns[batch.contact_places].tolist()
-        self._reports |= zip(times, batch.contacts, strict=True)
-        self._cycles |= zip(times, ticks.cycle[batch.contact_places].tolist(), strict=True)
-        logged = [event for event in part.events if ticks.t_ns[0] <= event.t_ns <= ticks.t_ns[-1]]
+        first_ns, last_ns = ticks.t_ns[[0, -1]].tolist()
+        reports = {t_ns: fields for t_ns, fields in part.contacts.items() if first_ns <= t_ns <= last_ns}
+        self.comparison.compare_contacts(reports, ticks, batch)
+        logged = [event for event in part.events if first_ns <= event.t_ns <= last_ns]
         replayed = [event for event in events if event.name in part.said]
         self.comparison.compare_events(logged, replayed, ticks)
 
@@ -189,17 +187,6 @@ class _Player:
             batches.append(self._pipeline.run(_arms_of(arms, slice(row, row + 1)), np.array([request], np.uint8)))
             self._asking.note_request(cycle, request, before, self._pipeline.state)
         return _joined(batches)
-
-    def compare_contacts(self, logged: Mapping[int, Mapping[str, Any]], exact: Sequence[tuple[int, int]]) -> None:
-        """Compare a part's contact reports with the logged ones, then forget them.
-
-        logged: fields of the logged reports by time, ns. exact: first and last time, ns, of each stretch that can be
-        compared.
-        """
-        if self.comparison is not None:
-            judged = {t_ns: record for t_ns, record in logged.items() if any(a <= t_ns <= b for a, b in exact)}
-            self.comparison.compare_contacts(judged, self._reports, self._cycles)
-        self._reports, self._cycles = {}, {}
 
 
 def _joined(batches: Sequence[SchemeBatch]) -> SchemeBatch:
@@ -295,12 +282,11 @@ def _replay_part(
     bounds_ns: tuple[int, int],
     watch: Watch | None,
 ) -> int:
-    """Replay the cycles of a piece of the log with each player, compare its contacts' reports; return their number.
+    """Replay the cycles of a piece of the log with each player; return their number.
 
     bounds_ns: begin and end of the reported time, on the run's clock; cycles from the end on are not replayed, but
     count in the number. watch: called with each player's decisions.
     """
-    exact: list[tuple[int, int]] = []
     cycles, (part, arms_of_part) = 0, decoded
     for stretch, all_arms in zip(part.stretches, arms_of_part, strict=True):
         for mine, rows, is_told in _split(stretch, bounds_ns):
@@ -308,11 +294,7 @@ def _replay_part(
                 batch = player.play(mine, _arms_of(arms, rows), part, is_told)
                 if watch is not None:
                     watch(place, mine.ticks, batch)
-            if mine.is_exact and is_told:
-                exact.append((int(mine.ticks.t_ns[0]), int(mine.ticks.t_ns[-1])))
         cycles += len(stretch.ticks.cycle)
-    for player in players:
-        player.compare_contacts(part.contacts, exact)
     return cycles
 
 

@@ -170,16 +170,14 @@ class SchemeComparison:
         self.mismatches = sorted(self.mismatches, key=lambda mismatch: mismatch.cycle)[: self._shown]
         return tuple(self.mismatches)
 
-    def compare_contacts(
-        self, logged: Mapping[int, Mapping[str, Any]], replayed: Mapping[int, ContactReport], cycles: Mapping[int, int]
-    ) -> None:
-        """Compare contact reports, each by the time at which it was made, ns; count and keep the mismatches.
+    def compare_contacts(self, logged: Mapping[int, Mapping[str, Any]], ticks: Ticks, batch: SchemeBatch) -> None:
+        """Compare the contact reports of a stretch, each by the time at which it was made.
 
-        A report without a counterpart is one. cycles: number of the cycle at each of these times; -1 stands for an
-        unknown one.
+        Count and keep the mismatches; a report without a counterpart is one. logged: fields by time, ns.
         """
+        replayed = dict(zip(ticks.t_ns[batch.contact_places].tolist(), batch.contacts, strict=True))
         for t_ns in sorted({*logged, *replayed}):
-            where = (cycles.get(t_ns, -1), t_ns)
+            where = (int(ticks.cycle[_row_at(ticks, t_ns)]), t_ns)
             theirs, ours = logged.get(t_ns), replayed.get(t_ns)
             if theirs is None or ours is None:
                 said = [("no report" if side is None else "a report") for side in (theirs, ours)]
@@ -209,7 +207,7 @@ class SchemeComparison:
             if theirs is not None and theirs.event == ours:
                 continue
             name = ours.name if theirs is None else theirs.event.name
-            row = 0 if theirs is None else int(np.searchsorted(ticks.t_ns, theirs.t_ns, "right")) - 1
+            row = 0 if theirs is None else _row_at(ticks, theirs.t_ns)
             cycle, t_ns = int(ticks.cycle[row]), int(ticks.t_ns[row])
             logged_text, replayed_text = _event_text(theirs and theirs.event), _event_text(ours)
             self.add_mismatch(Mismatch(EVENTS.name, name, "", cycle, t_ns, logged_text, replayed_text))
@@ -232,6 +230,11 @@ class SchemeComparison:
         if self._interrupt is not None and ((asked == Request.FINISH) & (logged != Request.FINISH)).any():
             self.unexplained.append((*self._interrupt, int(Request.FINISH), int(Request.NONE)))
             self._interrupt = None
+
+
+def _row_at(ticks: Ticks, t_ns: int) -> int:
+    """Return the index of the last cycle up to a time that is not before the first."""
+    return int(np.searchsorted(ticks.t_ns, t_ns, "right")) - 1
 
 
 def _event_text(event: Event | None) -> str:
