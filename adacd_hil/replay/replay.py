@@ -427,7 +427,6 @@ def _result(
         arms_compared=0 if comparison is None else comparison.arms,
         attempts=player.attempts,
         states=tuple(each for each in gatherer.transitions if each.t_ns >= first_ns),
-        contacts=tuple(each for each in gatherer.reports if each[0] >= first_ns),
         adaptation_s=tuple(took_s for t_ns, took_s in gatherer.adaptations if t_ns >= first_ns),
         parameters=dict(zip(player.settings.estimator.parameter_names, gatherer.theta_hat, strict=False)),
         score=score,

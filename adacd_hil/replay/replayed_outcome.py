@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.logged_run import Mismatch, begins_alarm, host_span, is_armed_in, last_armed
-from adacd_hil.records import JOINTS, LEARNING, PARAMETER_UNITS, ContactReport, FaultReason, SchemeState
+from adacd_hil.records import JOINTS, LEARNING, PARAMETER_UNITS, FaultReason, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.score.emulator_truth import HostCycles, KnownContacts, placed_contacts
@@ -46,14 +46,13 @@ class _Moment(NamedTuple):
 
 
 class OutcomeGatherer:
-    """Gathers the outcome of one replay from its decisions: states, reports, alarms, adaptations, sensitivity, score.
+    """Gathers the outcome of one replay from its decisions: states, alarms, adaptations, sensitivity, score.
 
     `truth`: the true contacts, None if unknown. behind_gap_ns, detections_ns: times of alarms, ns.
     """
 
     def __init__(self, settings: Settings, truth: KnownContacts | None) -> None:
         self.transitions: list[StateChange] = []
-        self.reports: list[tuple[int, ContactReport]] = []  # with the time of each, ns
         self.adaptations: list[tuple[int, float | None]] = []  # beginning, ns; duration, s, None: never in MONITOR
         self.theta_hat: tuple[float, ...] = ()
         self._settings = settings
@@ -77,7 +76,7 @@ class OutcomeGatherer:
         self._was_over = False
 
     def add_stretch(self, ticks: Ticks, batch: SchemeBatch, follows_gap: bool = False) -> None:
-        """Gather states, contacts and alarms of the next cycles, from the scheme's decisions in them.
+        """Gather states and alarms of the next cycles, from the scheme's decisions in them.
 
         follows_gap: the log lacks cycles of the attempt before them; the times of their alarms then also go into
         `behind_gap_ns`, as they may stem from the jump.
@@ -113,8 +112,6 @@ class OutcomeGatherer:
                     FaultReason(batch.fault[row]),
                 )
             )
-        for row, report in zip(batch.contact_places.tolist(), batch.contacts, strict=True):
-            self.reports.append((int(ticks.t_ns[row]), report))
         self.theta_hat = tuple(batch.block[-1, self._theta].tolist())
 
     def _keep(self, ticks: Ticks, batch: SchemeBatch) -> None:
@@ -237,13 +234,13 @@ class Replay:
 
     cycles: replayed in the stretch, of which `compared` were compared with the log; compared is 0 if the settings are
     not the log's. arms_compared: cycles whose state, decoded from frames, was compared with the log's. monitored_s: in
-    MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in `mismatched_fields`. contacts:
-    reports with their times, ns. parameters: the estimate of the last cycle. score: of contacts and alarms that begin
-    in the stretch, None if the truth is not known. adaptation_s: duration of each adaptation that begins in it, None if
-    it never got to MONITOR. zero_ns: time of the first ADAPT of the log, 0 without one. ending: the last change of
-    state, which may be before the stretch, None without one. threshold_Nm: median in MONITOR of each joint's lowest
-    threshold of all channels, nan if it never monitored; push_Nm: of the smallest push found within `PUSH_WITHIN`, an
-    estimate, () in the paper's scheme. attempts, threshold_Nm, push_Nm: from the log's beginning.
+    MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in `mismatched_fields`. parameters:
+    the estimate of the last cycle. score: of contacts and alarms that begin in the stretch, None if the truth is not
+    known. adaptation_s: duration of each adaptation that begins in it, None if it never got to MONITOR. zero_ns: time
+    of the first ADAPT of the log, 0 without one. ending: the last change of state, which may be before the stretch,
+    None without one. threshold_Nm: median in MONITOR of each joint's lowest threshold of all channels, nan if it never
+    monitored; push_Nm: of the smallest push found within `PUSH_WITHIN`, an estimate, () in the paper's scheme.
+    attempts, threshold_Nm, push_Nm: from the log's beginning.
     """
 
     settings: Settings
@@ -253,7 +250,6 @@ class Replay:
     arms_compared: int
     attempts: int
     states: tuple[StateChange, ...]
-    contacts: tuple[tuple[int, ContactReport], ...]
     adaptation_s: tuple[float | None, ...]
     parameters: dict[str, float]
     score: Score | None
@@ -399,7 +395,7 @@ def as_json(found: Replay) -> dict[str, Any]:
     """Return a replay's outcome in plain values for JSON; times in s since the first ADAPT, see `Replay.time_s`.
 
     Contacts are the true ones; they, false alarms and missed contacts are None if the truth is not known. Left out are
-    thresholds that aren't finite, contact reports, the comparison with the log, and notes.
+    thresholds that aren't finite, the comparison with the log, and notes.
     """
     return {
         "cycles": found.cycles,

@@ -41,7 +41,7 @@ def test_a_replay_comes_to_the_same_bits_through_contact_fault_and_recovery(log,
     assert found.attempts == 2
     assert found.compared == found.cycles == len(read_log(log, ("/scheme",)).scheme)
     assert [each.fault for each in found.states if each.state is SchemeState.FAULT] == [FaultReason.DRIVE]
-    assert len(found.contacts) == len(read_log(log, ("/contact",)).contacts) > 0
+    assert len(read_log(log, ("/contact",)).contacts) > 0
 
 
 @pytest.mark.parametrize(("is_old", "by_frames"), [(False, False), (False, True), (True, False)])
@@ -173,8 +173,6 @@ def test_of_a_stretch_that_alone_is_compared_and_told(log, cycles_per_piece):
     assert found.score.contacts == whole.score.contacts
     assert found.states == tuple(each for each in whole.states if bounds_ns[0] <= each.t_ns < bounds_ns[1])
     assert found.ending == found.states[-1]
-    assert found.contacts == tuple(each for each in whole.contacts if bounds_ns[0] <= each[0] < bounds_ns[1])
-    assert 0 < len(found.contacts) <= len(whole.contacts)
     assert found.adaptation_s == ()
     assert 0.0 < found.monitored_s < 0.5
     after = stretched(log, TimeWindow(stretch.end_s), cycles_per_piece=cycles_per_piece)
