@@ -28,7 +28,7 @@ from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.records import ArmBatch, Event, Request, SchemeState
 from adacd_hil.replay.can_recording import RecordingAlone
-from adacd_hil.replay.log_source import CycleStretch, LogSource, Part
+from adacd_hil.replay.log_source import SAID, CycleStretch, LogSource, Part
 from adacd_hil.replay.replayed_outcome import OutcomeGatherer, Replay
 from adacd_hil.replay.scheme_comparison import (
     TOLERANCE,
@@ -162,7 +162,7 @@ class _Player:
         reports = {t_ns: fields for t_ns, fields in part.contacts.items() if first_ns <= t_ns <= last_ns}
         self.comparison.compare_contacts(reports, ticks, batch)
         logged = [event for event in part.events if first_ns <= event.t_ns <= last_ns]
-        replayed = [event for event in events if event.name in part.said]
+        replayed = [event for event in events if event.name in SAID]
         self.comparison.compare_events(logged, replayed, ticks)
 
     def _begin(self) -> None:
