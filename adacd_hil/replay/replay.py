@@ -44,6 +44,10 @@ from adacd_hil.score.wording import number_of, unjudged_sentence
 from adacd_hil.settings.configuration import Settings
 
 _PROGRESS_CYCLES: Final = 200_000
+_OTHER_FRAMES: Final = "a setting is another by which the arm takes its frames: they are decoded, which takes longer"
+_NO_ARM: Final = (
+    "the log has no /arm, as an older one or one without a cycle: its frames are decoded, which takes longer"
+)
 
 ReplaySource = LogSource | RecordingAlone
 Watch = Callable[[int, Ticks, SchemeBatch], None]
@@ -232,8 +236,8 @@ def replay_source(
         asking = Asking(settings, script_of) if is_scripted and script_of is not None else None
         players.append(_Player(settings, truth, comparison, asking, by_frames))
     reader = _ArmReader(source, variants, by_frames)
-    if not by_frames and (reason := why_frames(source, variants)):
-        progress(reason)
+    if reader.needs_frames and not (by_frames or source.is_recording):
+        progress(_OTHER_FRAMES if source.has_arms else _NO_ARM)
     done = 0
     milestones = Milestones(lambda count: progress(f"{count} cycles replayed"), _PROGRESS_CYCLES)
     for part in _one_ahead(_decoded(source, reader, bounds_ns[1])):
@@ -366,21 +370,6 @@ class _ArmReader:
         if self._logged_key is not None and stretch.arms is not None:
             batches[self._logged_key] = stretch.arms
         return [batches[key] for key in self._keys]
-
-
-def why_frames(source: ReplaySource, variants: Sequence[Settings]) -> str:
-    """Return the reason why frames must be decoded, which takes longer, in one line; "" if the log's states serve.
-
-    "" also for a recording, which has only frames.
-    """
-    if source.is_recording:
-        return ""
-    if not source.has_arms:
-        return "the log has no /arm, as an older one or one without a cycle: its frames are decoded, which takes longer"
-    own = _decoding_key(source.settings)
-    if all(_decoding_key(settings) == own for settings in variants):
-        return ""
-    return "a setting is another by which the arm takes its frames: they are decoded, which takes longer"
 
 
 def _decoding_key(settings: Settings) -> Any:

@@ -71,7 +71,13 @@ class SchemeComparison:
         self._shown = shown
         self._tolerance = tolerance
         self._layout: Layout = layout_of(settings)
-        self._names = _place_names(settings, self._layout)
+        parameters, further = settings.estimator.parameter_names, settings.further_names
+        self._names = {  # of the values of fields that aren't by joint
+            "theta_hat": parameters,
+            "paper_theta_hat": parameters,
+            "theta_further": further,
+            "theta_std": (*parameters, *further),
+        }
         self._scales: dict[str, Vector] = {}
 
     def compare(self, scheme: Series, ticks: Ticks, batch: SchemeBatch) -> None:
@@ -149,7 +155,7 @@ class SchemeComparison:
         self.count += len(rows)
         self.fields[f"{topic}.{name}"] += len(rows)
         for row, column in zip(rows[: self._shown].tolist(), columns[: self._shown].tolist(), strict=True):
-            names = self._names.get(name, ("",) if logged.shape[1] == 1 else _JOINTS)
+            names = self._names.get(name) or _places(logged.shape[1])
             values = (repr(side[row, column].item()) for side in (logged, replayed))
             self._keep(Mismatch(topic, name, names[column], int(ticks.cycle[row]), int(ticks.t_ns[row]), *values))
 
@@ -256,22 +262,8 @@ def _contact_values(logged: Mapping[str, Any], replayed: ContactReport) -> Itera
             yield field, "", theirs, type(theirs)(ours)
 
 
-def _place_names(settings: Settings, layout: Layout) -> dict[str, tuple[str, ...]]:
-    """Return the names of the values of each field of the block, by field, such as a1 or joint 1; see `_names_of`."""
-    parameters, further = settings.estimator.parameter_names, settings.further_names
-    named = {
-        "theta_hat": parameters,
-        "paper_theta_hat": parameters,
-        "theta_further": further,
-        "theta_std": (*parameters, *further),
-    }
-    return {field.name: _names_of(field.name, field.size, named) for field in layout.fields}
-
-
-def _names_of(name: str, size: int, named: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Return the names of a field's values: those in `named`, else "" for one value, joints, or channels and joints."""
-    if name in named:
-        return tuple(named[name])
+def _places(size: int) -> tuple[str, ...]:
+    """Return the places of a field's values (size): "" for one value, the joints, or the joints of each channel."""
     if size == 1:
         return ("",)
     if size == JOINTS:
