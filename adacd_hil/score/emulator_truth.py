@@ -325,12 +325,16 @@ def threshold_in_force(threshold: Vector, settings: Settings) -> Vector:
     return np.where(np.isfinite(threshold), threshold, settings.detector.threshold_Nm)
 
 
-KnownContacts = tuple[tuple[TrueContact, ...], EmulatorSpan]
-"""The true contacts of a run, in order, and of which cycles they are known."""
+class KnownContacts(NamedTuple):
+    """The true contacts of a run, in order, of which cycles they are known, and the rows of the truth."""
+
+    contacts: tuple[TrueContact, ...]
+    span: EmulatorSpan
+    rows: Truth
 
 
 def contacts_beside(path: Path, progress: Progress = lambda _: None) -> KnownContacts | None:
-    """Return the true contacts of a log's run from truth.mcap beside it, and the cycles of which they are known.
+    """Return what truth.mcap beside a log knows of the true contacts of its run.
 
     None without that file, if the emulator never cycled, and for a truth of another run or one whose heads can't be
     read, of which `progress` gets a line. Raises LogError for a truth with invalid metadata.
@@ -342,4 +346,4 @@ def contacts_beside(path: Path, progress: Progress = lambda _: None) -> KnownCon
         progress(f"{problem}; it is left out")
         return None
     table = read_truth(truth)
-    return None if table.span is None else (true_contacts(table.rows), table.span)
+    return None if table.span is None else KnownContacts(true_contacts(table.rows), table.span, table.rows)

@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.log.logged_run import Truth, cycle_offsets
-from adacd_hil.records import JOINTS, ContactReport, Vector
+from adacd_hil.records import JOINTS, ContactReport, SchemeState, Vector
+from adacd_hil.settings.configuration import Settings
 
 Times = NDArray[np.int64]
 
@@ -35,7 +36,8 @@ class Detection:
     """An alarm of a scheme. is_armed: raised by armed detection, in MONITOR.
 
     is_known: the truth covers that time, or there is no truth. row: index in the run's cycles, -1: unknown. first,
-    last: its report at the alarm, and the newest one of the same contact; None without a report.
+    last: its report at the alarm, and the newest one of the same contact; None without a report. is_weight: it is about
+    the weight of a payload, see `is_about_weight`.
     """
 
     t_ns: int
@@ -44,6 +46,20 @@ class Detection:
     row: int = -1
     first: ContactReport | None = None
     last: ContactReport | None = None
+    is_weight: bool = False
+
+
+def is_about_weight(truth: Truth, settings: Settings, cycle: int, before: int, armed: int) -> bool:
+    """Return whether an alarm in a cycle is about the weight of a payload that the scheme has not learnt yet.
+
+    It is, under gravity, if the state before is PAYLOAD, and the true payload differs from that in `armed`, the last
+    cycle in MONITOR before. False without such a cycle (-1), or if the truth has no payload. Cycles are counted as
+    those of the truth's payloads.
+    """
+    if armed < 0 or before != SchemeState.PAYLOAD or not settings.estimator.gravity:
+        return False
+    known, now = truth.model_row(armed), truth.model_row(cycle)
+    return known is not None and now is not None and bool(truth.payload_kg[known] != truth.payload_kg[now])
 
 
 def begins_of(at: NDArray[Any], pause: float, last: float | None = None) -> NDArray[np.bool_]:
@@ -174,11 +190,13 @@ def contacts_of_alarms(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[An
 def judge(contacts: Sequence[TrueContact], alarms: Sequence[Detection], crossings_ns: Sequence[int] = ()) -> Score:
     """Return when each true contact was found, and which alarms are false or not judged; all in the order of time.
 
-    Alarms that the truth doesn't cover are not judged, even if they find a contact. crossings_ns: times at which a
+    Alarms about a payload's weight are left out. Those that the truth doesn't cover are not judged, even if they find a
+    contact. crossings_ns: times at which a
     scheme, replayed on another scheme's motion, first exceeds a threshold. While it still reacts it can raise no alarm:
     then, if no alarm finds a contact that began meanwhile (`is_reacting`), a crossing does.
     """
     onsets, until = explained_times(contacts)
+    alarms = [alarm for alarm in alarms if not alarm.is_weight]
     about = contacts_of_alarms(np.array([alarm.t_ns for alarm in alarms], np.int64), onsets, until).tolist()
     found = _first(about, [alarm.t_ns for alarm in alarms])
     crossed = _first(contacts_of_alarms(np.array(crossings_ns, np.int64), onsets, until).tolist(), crossings_ns)

@@ -252,7 +252,7 @@ def record(path: Path, run: Run, attachments: dict[str, bytes] | None = None, cl
             state = SchemeState(run.state[row])
             joints = int(state is SchemeState.REACT)
             output = SchemeOutput(
-                cycle, state, state, FaultReason.NONE, joints, False, run.theta_hat[row], run.theta_hat[row],
+                cycle, state, state, FaultReason.NONE, joints, False, run.theta_hat[row],
                 run.tau_ext_hat[row], None, blocks[row],
             )  # fmt: skip
             times = CycleRecord(*(int(run.timing[name][row]) for name in CycleRecord._fields))

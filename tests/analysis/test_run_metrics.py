@@ -22,10 +22,14 @@ from hand_made_run import (
     touched_run,
 )
 
+from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.lab.score.run_arrays import StretchOfRun, section_label, split_sections
 from adacd_hil.log.logged_run import Span
 from adacd_hil.log.time_window import WHOLE
 from adacd_hil.records import FaultReason, SchemeState
+from adacd_hil.replay.replayed_outcome import OutcomeGatherer
+from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
+from adacd_hil.score.emulator_truth import KnownContacts
 from adacd_hil.score.judge import filtered
 
 SETTLING_ROWS = 1000
@@ -38,6 +42,24 @@ def upright(run):
     arm, estimator = replace(run.settings.arm, cad_theta=()), run.settings.estimator
     settings = replace(run.settings, arm=arm, estimator=replace(estimator, gravity=True, P0=(1.0,) * 9))
     return replace(run, settings=settings, theta_hat=np.pad(run.theta_hat, ((0, 0), (0, 2))))
+
+
+def replayed(run, cut):
+    """Return the score of a replay that comes to the states of a run, in two pieces."""
+    truth = (), ((0, 0), (0, len(run.cycle) + FIRST_CYCLE)), run.truth
+    gatherer = OutcomeGatherer(run.settings, KnownContacts(*truth))
+    gatherer.begin_attempt(0, FIRST_CYCLE)
+    previous = np.concatenate(([SchemeState.INIT], run.state[:-1]))
+    for rows in (slice(0, cut), slice(cut, None)):
+        cycle = run.cycle[rows]
+        is_over = run.state[rows] == R
+        block = np.zeros((len(cycle), layout_of(run.settings).size))
+        nothing = np.zeros(len(cycle), np.uint8)
+        batch = SchemeBatch(
+            cycle, run.state[rows], previous[rows], nothing, nothing, is_over * 1, nothing > 0, block, [], cycle[:0]
+        )
+        gatherer.add_stretch(Ticks(cycle, run.t_ns[rows], np.ones_like(cycle)), batch)
+    return gatherer.score()
 
 
 def test_time_counts_from_motion_start_and_without_one_from_the_first_cycle():
@@ -178,6 +200,8 @@ def test_the_weight_of_a_payload_that_is_fitted_is_no_false_alarm(row, payload_f
     run = upright(run) if has_gravity else run
     run.truth.payload_kg[payload_from:] = 1.0
     assert evaluated(run).false_alarms == false_alarms
+    for cut in (row - 300, row):
+        assert len(replayed(run, cut).false_alarms) == false_alarms
 
 
 # Of 5 Nm for 0.25 s 4.59 Nm are in the filter; they are back at 0.15 Nm after 342 ms, and one time constant is 100 ms.

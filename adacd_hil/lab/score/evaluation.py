@@ -39,7 +39,6 @@ from adacd_hil.lab.score.run_judge import (
     contacts_of,
     find_detections,
     ideal_response,
-    judge_run,
     row_at,
     step_delay_s,
 )
@@ -47,7 +46,7 @@ from adacd_hil.lab.score.verdict import compare_with_paper, list_findings
 from adacd_hil.log.logged_run import Cycles
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, SchemeState, Vector
 from adacd_hil.score.distribution import Distribution
-from adacd_hil.score.judge import Detection, Score, TrueContact
+from adacd_hil.score.judge import Detection, Score, TrueContact, judge
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.scheme_settings import KIND_S
 
@@ -79,7 +78,7 @@ def evaluate(run: Run, gathered: RunGatherer) -> Metrics:
     """Return all metrics of a run; gathered: the sums over all cycles."""
     timing, data = gathered.timing.evidence(), gathered.data.data(run)
     detections = find_detections(run)
-    score = judge_run(run, contacts_of(run), detections)
+    score = judge(contacts_of(run), detections)
     sections = split_sections(run)
     adaptation_s: dict[str, float | None] = {}
     parameters: dict[str, dict[str, tuple[float | None, float]]] = {}

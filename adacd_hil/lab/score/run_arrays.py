@@ -400,13 +400,8 @@ def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> 
         return None
     cycle = host_cycles(rows.cycle, rows.attempt, begins)
     of_host = (cycle <= last) & (rows.attempt < len(begins))
-    known = rows.model_attempt < len(begins)
     return replace(
-        truth_rows(replace(rows, cycle=cycle, time_s=time_s), of_host),
-        payload_kg=rows.payload_kg[known],
-        theta=rows.theta[known],
-        model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins)[known],
-        model_attempt=rows.model_attempt[known],
+        truth_rows(replace(rows.with_host_models(begins), cycle=cycle, time_s=time_s), of_host),
         span=host_span(table.span, begins),
     )
 
