@@ -191,9 +191,9 @@ def judge(contacts: Sequence[TrueContact], alarms: Sequence[Detection], crossing
     """Return when each true contact was found, and which alarms are false or not judged; all in the order of time.
 
     Alarms about a payload's weight are left out. Those that the truth doesn't cover are not judged, even if they find a
-    contact. crossings_ns: times at which a
-    scheme, replayed on another scheme's motion, first exceeds a threshold. While it still reacts it can raise no alarm:
-    then, if no alarm finds a contact that began meanwhile (`is_reacting`), a crossing does.
+    contact. crossings_ns: times at which a scheme, replayed on another scheme's motion, first exceeds a threshold.
+    While it still reacts it can raise no alarm: then, if no alarm finds a contact that began meanwhile (`is_reacting`),
+    a crossing does.
     """
     onsets, until = explained_times(contacts)
     alarms = [alarm for alarm in alarms if not alarm.is_weight]
