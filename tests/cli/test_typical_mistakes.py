@@ -93,6 +93,8 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("excitation --seconds nan", USAGE, ("nan is not finite",)),
     ("thresholds log.mcap --rate-per-h nan", USAGE, ("nan is not finite",)),
     ("demo --live --live-port {port}", FAILURE, ("can't listen on 127.0.0.1:{port}", "--live-port 0 takes one")),
+    ("demo --live --live-host a..b", FAILURE, ("can't listen on a..b:8765: that is no name of a machine",)),
+    ("demo --live --live-host a..b --live-port 0", FAILURE, ("can't listen on a..b:0: that is no name",)),
     # -- the configuration
     ("demo --config papper", USAGE, ("'papper' is neither built in nor a file", "did you mean 'paper'?")),
     ("demo --config my-arms.toml", USAGE, ("my-arms.toml does not exist", "did you mean 'my-arm.toml'?")),
