@@ -130,7 +130,7 @@ def apply_settings(settings: Settings, changes: Mapping[str, str]) -> Settings:
     """Return the settings with some keys changed. changes: by dotted key, a TOML value as text.
 
     A word needs no quotes; a single value stands for a list of it, unless the list may be absent. Raises ConfigError
-    for an unknown key, a text that is no TOML value, and a value that `parse` refuses.
+    for an unknown key, a text that is no TOML value, and a value that `parse_toml` or `parse` refuses.
     """
     table = tomllib.loads(to_toml(settings))
     known = known_keys()
@@ -160,12 +160,14 @@ def refuse_log_settings(changes: Mapping[str, str]) -> None:
 def _read_value(key: str, text: str) -> Any:
     """Parse a text as a TOML value.
 
-    Return a text that is no TOML as a string, for words without quotes. Raises ConfigError, which names the key, for
-    such a text if it is empty or holds a quote, bracket, brace, `=`, `#` or newline.
+    Return a text that is no TOML as a string, for words without quotes. Raises ConfigError for such a text if it is
+    empty or holds a quote, bracket, brace, `=`, `#` or newline, and for a value beyond the limits of `parse_toml`.
     """
     try:
-        return parse_toml(f"value = {text}")["value"]
-    except ConfigError:
+        return parse_toml(f'"{key}" = {text}')[key]
+    except ConfigError as error:
+        if error.__cause__ is None:
+            raise
         if text and not set(text) & set("\"'[]{}=\n#"):
             return text
         raise ConfigError(f"`{key}` = {text} is not a TOML value") from None

@@ -50,9 +50,10 @@ def _instead(path: Path, kind: str) -> str:
 
 
 def parse_toml(text: bytes | str) -> dict[str, Any]:
-    """Return the table of a TOML text, at most 16 deep, with integers of 64 bits. Raises ConfigError with the reason.
+    """Return the table of a TOML text, at most 16 deep, with integers of 64 bits.
 
-    A byte order mark at the beginning, as editors on Windows write it, is ignored.
+    A byte order mark at the beginning, as editors on Windows write it, is ignored. Raises ConfigError with the reason;
+    its cause is a TOMLDecodeError for a text that is no TOML, else None.
     """
     try:
         decoded = (text if isinstance(text, str) else text.decode("utf-8")).removeprefix("\ufeff")
@@ -67,7 +68,7 @@ def parse_toml(text: bytes | str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         comma = _DECIMAL_COMMA.search(decoded)
         hint = f"; `{comma[0]}`: a decimal point, not a comma?" if comma else ""
-        raise ConfigError(f"{one_line(error)}{hint}") from None
+        raise ConfigError(f"{one_line(error)}{hint}") from error
     except ValueError:  # too many digits for Python
         raise ConfigError("an integer has more than 64 bits") from None
     _check_extent(table)

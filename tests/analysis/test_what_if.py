@@ -48,6 +48,7 @@ def test_a_list_a_number_a_quoted_and_a_bare_word_are_taken():
         ("filter.a_rad_s", "-1", "`filter.a_rad_s` = -1.0 rad/s is below 0.1 rad/s"),
         ("filter.a_rad_s", "fast", "`filter.a_rad_s` = 'fast' must be of type float"),
         ("filter.a_rad_s", "[1", "`filter.a_rad_s` = [1 is not a TOML value"),
+        ("arm.sign", "5000000000000000000000", "`arm.sign` is an integer of more than 64 bits"),
         ("detector.threshold_Nm", "[0.1]", "`detector.threshold_Nm` has 1 values, 2 expected"),
     ],
 )
