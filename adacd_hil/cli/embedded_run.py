@@ -28,7 +28,6 @@ from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.bench.bench_time import TruthLog
-from firmware_sim.body.body import Body
 from firmware_sim.canopen.object_dictionary import EmulatedContract, playable_contract
 from firmware_sim.cli.own_devices import rehearse_settings
 from firmware_sim.scenario.rehearsal import told_arm
@@ -134,7 +133,7 @@ def run_embedded(
                 touched_ns = None if block[_TOUCHED_LINK] == 0.0 else touched_ns or t_ns
                 truth.write(cycle, t_ns, block)
 
-            with compiling_cycle(settings, Body.compiled_functions):
+            with compiling_cycle(settings):
                 bench = Bench(
                     scenario,
                     codec,
