@@ -1,8 +1,8 @@
 """The keys of a configuration: their list, their values in words, and changes of single ones.
 
 `known_keys` lists every key with type, default, bounds, unit and meaning. `apply_settings` changes single keys: a key
-is dotted, `detector.threshold_Nm`; a value is TOML, where a word needs no quotes and a single value stands for a list
-of it, unless the list may be absent. Settings that determined the numbers of a log can't be changed for its replay.
+is dotted, `detector.threshold_Nm`; a value is TOML, where a word needs no quotes and a single value stands for a list,
+see `apply_settings`. Settings that determined the numbers of a log can't be changed for its replay.
 """
 
 import dataclasses
@@ -129,8 +129,10 @@ _FACTS: Final = ("profile", "sign", "torque_offset_Nm", "torque_offset_std_Nm", 
 def apply_settings(settings: Settings, changes: Mapping[str, str]) -> Settings:
     """Return the settings with some keys changed. changes: by dotted key, a TOML value as text.
 
-    A word needs no quotes; a single value stands for a list of it, unless the list may be absent. Raises ConfigError
-    for an unknown key, a text that is no TOML value, and a value that `parse_toml` or `parse` refuses.
+    A word needs no quotes. A single value stands for a list, unless that may be absent: it fills a list of fixed length
+    and one of floats, such as `certified.prior_std`; any other list, such as `certified.friction_terms`, and an empty
+    one get it alone. Raises ConfigError for an unknown key, a text that is no TOML value, and a value that `parse_toml`
+    or `parse` refuses.
     """
     table = tomllib.loads(to_toml(settings))
     known = known_keys()
@@ -174,16 +176,16 @@ def _read_value(key: str, text: str) -> Any:
 
 
 def _spread(value: Any, kind: Any, present: Any) -> Any:
-    """Return a single value repeated to a list if the setting is a list that can't be absent; else return the value.
+    """Return a single value as a list if the setting is a list that can't be absent; else return the value.
 
-    kind: the setting's type. The list is as long as `present`, the setting's value so far, or, if that is no list, as
-    `kind` says.
+    kind: the setting's type. present: the setting's value so far. A list of fixed length, and one of floats unless it
+    is empty, keeps its length; any other list has the value alone.
     """
-    if typing.get_origin(kind) is tuple and not isinstance(value, list):
-        elements = [element for element in typing.get_args(kind) if element is not Ellipsis]
-        count = len(present) if isinstance(present, list) else len(elements)
-        return [value] * count
-    return value
+    if typing.get_origin(kind) is not tuple or isinstance(value, list):
+        return value
+    element, *others = typing.get_args(kind)
+    keeps_length = element is float or Ellipsis not in others
+    return [value] * (len(present) if keeps_length and present else 1)
 
 
 def keep_log_settings(own: Settings, other: Settings) -> Settings:

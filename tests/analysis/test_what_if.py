@@ -14,6 +14,7 @@ from adacd_hil.settings.setting_keys import (
     parse_changes,
     parse_variations,
     split_list,
+    value_of,
 )
 
 PAPER = load_settings("paper")
@@ -38,6 +39,25 @@ def test_a_list_a_number_a_quoted_and_a_bare_word_are_taken():
     assert [(entry.at_s, entry.request) for entry in changed.operator.script] == [(1.5, "finish")]
     assert changed.devices.quick_stop_option == 6
     assert changed.trajectory == PAPER.trajectory
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "taken"),
+    [
+        ("detector.threshold_Nm", "0.3", (0.3, 0.3)),
+        ("certified.prior_std", "0.3", (0.3,) * 7),
+        ("certified.friction_terms", "stribeck", ("stribeck",)),
+        ("safety.tolerated_emergencies", "0x8210", (0x8210,)),
+        ("assumed", "arm.sign", ("arm.sign",)),
+    ],
+)
+def test_a_single_value_fills_a_list_whose_length_is_fixed_and_is_any_other_list_alone(key, value, taken):
+    assert value_of(apply_settings(PAPER, {key: value}), key) == taken
+
+
+def test_a_single_number_is_not_lost_in_an_empty_list():
+    with pytest.raises(ConfigError, match=r"`arm\.cad_theta` has 1 values, 7 expected"):
+        apply_settings(apply_settings(PAPER, {"arm.cad_theta": "[]"}), {"arm.cad_theta": "0.1"})
 
 
 @pytest.mark.parametrize(
