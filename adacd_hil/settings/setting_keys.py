@@ -13,6 +13,7 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
+from adacd_hil.plain_values import plain_values
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.parsing import describe_gone, parse
@@ -252,18 +253,10 @@ def split_list(text: str) -> list[str]:
 
 def changed_keys(before: Settings, after: Settings) -> dict[str, tuple[str, str]]:
     """Return the settings that differ, by dotted key: (before, after) as Python writes them; `unset` for None."""
-    tables = [_flat(tomllib.loads(to_toml(settings)), "") for settings in (before, after)]
-    keys = [*tables[0], *(key for key in tables[1] if key not in tables[0])]
-    words = {key: (tables[0].get(key, "unset"), tables[1].get(key, "unset")) for key in keys}
-    return {key: pair for key, pair in words.items() if pair[0] != pair[1]}
+    keys = [key for key, known in known_keys().items() if not known.is_in_row]
+    pairs = {key: (_as_python(value_of(before, key)), _as_python(value_of(after, key))) for key in keys}
+    return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
 
-def _flat(table: Mapping[str, Any], prefix: str) -> dict[str, str]:
-    """Return the values of a table and its inner tables as Python writes them, by dotted key after `prefix`."""
-    flat: dict[str, str] = {}
-    for key, value in table.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = repr(value)
-    return flat
+def _as_python(value: Any) -> str:
+    return "unset" if value is None else repr(plain_values(value))
