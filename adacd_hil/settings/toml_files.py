@@ -1,4 +1,4 @@
-"""TOML files: found by name, and read within limits."""
+"""Files found by their built-in names, and TOML files, read within limits."""
 
 import re
 import tomllib
@@ -100,19 +100,20 @@ def builtin_names() -> list[str]:
     return toml_names(builtin_folder())
 
 
-def toml_names(folder: Traversable) -> list[str]:
-    """Return the names of the TOML files in a package's folder, without `.toml`."""
-    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+def toml_names(folder: Traversable, suffix: str = ".toml") -> list[str]:
+    """Return the names of the TOML files in a package's folder, or of files with another suffix, without that."""
+    return sorted(entry.name.removesuffix(suffix) for entry in folder.iterdir() if entry.name.endswith(suffix))
 
 
-def find_toml(kind: str, name_or_file: str, folder: Traversable) -> Path:
+def find_named(kind: str, name_or_file: str, folder: Traversable, suffix: str = ".toml") -> Path:
     """Return the file of a built-in name in `folder`, or the given path; a path with a suffix may be missing.
 
-    Raises ConfigError for any other name, with the nearest built-in one. kind: of the file, for the error.
+    Raises ConfigError for any other name, with the nearest built-in one. kind: of the file, for the error. suffix: of
+    the files in the folder.
     """
-    names = toml_names(folder)
+    names = toml_names(folder, suffix)
     if name_or_file in names:
-        return Path(str(folder / f"{name_or_file}.toml"))
+        return Path(str(folder / f"{name_or_file}{suffix}"))
     path = Path(name_or_file)
     if not name_or_file or (not path.suffix and not exists(path)):
         nearest = nearest_name(name_or_file, names)
