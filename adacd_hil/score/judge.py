@@ -288,14 +288,12 @@ def forgotten_after_s(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: f
     return (1.0 + math.log(max(1.0, excess))) / a_rad_s
 
 
-def true_contacts(truth: Truth | None, first_number: int = 1) -> tuple[TrueContact, ...]:
-    """Return the true contacts in a truth, numbered from `first_number`; () without a truth.
+def true_contacts(truth: Truth, first_number: int = 1) -> tuple[TrueContact, ...]:
+    """Return the true contacts in a truth, numbered from `first_number`.
 
     Each has its own rows of the truth, and the one after them if that is of the same attempt. Their cycles are the
     emulator's; their times on a run's clock are still 0.
     """
-    if truth is None:
-        return ()
     found = []
     bounds = contact_bounds(truth.contact_index, truth.attempt)
     for number, (start, end) in enumerate(bounds, first_number):
