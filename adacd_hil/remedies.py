@@ -1,6 +1,6 @@
-"""The known name that is most like a word, for error messages."""
+"""The known name that is most like a word, and the hint at it in an error message."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from difflib import SequenceMatcher
 
 _SHORTEST, _LONGEST = 2, 64
@@ -21,6 +21,12 @@ def nearest_name(word: str, known: Iterable[str]) -> str | None:
     found = ((_likeness(word.casefold(), name.casefold()), name) for name in known)
     likeness, name = max(found, key=lambda pair: pair[0], default=(0.0, ""))
     return name if likeness >= _LIKE else None
+
+
+def hint(word: str, known: Collection[str]) -> str:
+    """Return "did you mean 'NAME'?" with the nearest known name of a word, else "known: " and all names or "none"."""
+    near = nearest_name(word, known)
+    return f"did you mean {near!r}?" if near else f"known: {', '.join(known) or 'none'}"
 
 
 def _likeness(word: str, name: str) -> float:

@@ -62,9 +62,18 @@ signals = [
 
 
 def write_drive(folder: Path) -> Path:
-    """Write a drive with position, velocity and target torque in objects of its maker, in other PDOs than ours."""
-    eds = EdsVariant()
-    for index, kind, access in (("2063", "0x0004", "ro"), ("2069", "0x0004", "ro"), ("2071", "0x0003", "rww")):
+    """Write a drive with position, velocity and target torque in objects of its maker, in other PDOs than ours.
+
+    0x2000, the contract's in our devices, is its maker's own.
+    """
+    eds = EdsVariant().with_object("2000", 0, ObjectType="0x9")
+    for index, kind, access in (
+        ("2000sub1", "0x0007", "ro"),
+        ("2000sub2", "0x0007", "ro"),
+        ("2063", "0x0004", "ro"),
+        ("2069", "0x0004", "ro"),
+        ("2071", "0x0003", "rww"),
+    ):
         eds.with_object(index, 0, DataType=kind, AccessType=access, PDOMapping="1")
     eds.write(folder / "other_drive.eds")
     ours = (resources.files("adacd_hil") / "device_profiles" / "stock-drive.toml").read_text()

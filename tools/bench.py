@@ -133,7 +133,7 @@ def bench_in_process() -> None:
         peer.get_message_by_name("Drive1Feedback"),
         peer.get_message_by_name("Drive1Command"),
     )
-    wire = bytes(feedback.encode(0.3, -1.2))
+    wire = bytes(feedback.encode_raw(50_066, -2_400))
     sender = command.sender()
     fields = {"e2e_crc": 0, "e2e_counter": 0, "e2e_status": 0, "controlword": 15, "target_torque": -123}
     time_calls("codec: decode feedback", lambda: feedback.decode_values(wire))

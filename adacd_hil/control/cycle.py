@@ -26,11 +26,11 @@ from adacd_hil.device.drive import DISABLE_CYCLES
 from adacd_hil.device.network import Master
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import (
+    CONTROL,
+    CYCLE,
     ChannelId,
     pack_arm,
     pack_contact,
-    pack_control,
-    pack_cycle,
     pack_frame_checks,
     pack_scheme,
 )
@@ -304,8 +304,8 @@ class Cycle:
         messages = [
             (ChannelId.SCHEME, pack_scheme(output, request)),
             (ChannelId.ARM, pack_arm(arm, self._first_cycle)),
-            (ChannelId.CONTROL, pack_control(arm.cycle, self._block, flags, command.enable, command.quick_stop)),
-            (ChannelId.CYCLE, pack_cycle(record)),
+            (ChannelId.CONTROL, CONTROL.pack(arm.cycle, flags, command.enable, command.quick_stop, block=self._block)),
+            (ChannelId.CYCLE, CYCLE.pack(*record)),
         ]
         if self._frame_checks.take_turn(arm.cycle):
             messages.append((ChannelId.FRAME_CHECKS, pack_frame_checks(self._arm.frame_checks())))

@@ -56,14 +56,17 @@ class DriveUnits(NamedTuple):
         """Whether `increments_per_joint_rev` is known and at least LEAST_INCREMENTS: fewer are the factory's 1 : 1."""
         return (self.increments_per_joint_rev or 0.0) >= LEAST_INCREMENTS
 
+    @property
+    def stated_gear_ratio(self) -> float | None:
+        """`gear_ratio`; None, too, for 1 : 1, the factory's value."""
+        return None if self.gear_ratio == 1.0 else self.gear_ratio
+
     def is_other_gear(self, ratio: float) -> bool:
         """Return whether 0x6091 differs from a profile's `scale.gear_ratio` by more than 0.1 %; False without 0x6091.
 
-        1 in the profile doesn't contradict: 0x6076 is then the joint's. Nor does 1 : 1 in the drive, the factory's
-        value.
+        1 in the profile doesn't contradict: 0x6076 is then the joint's. Nor does 1 : 1 in the drive.
         """
-        is_stated = self.gear_ratio not in (None, 1.0) and ratio != 1.0
-        return is_stated and not math.isclose(ratio, self.gear_ratio or 0.0, rel_tol=1e-3)
+        return ratio != 1.0 and not math.isclose(ratio, self.stated_gear_ratio or ratio, rel_tol=1e-3)
 
 
 def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:
@@ -88,7 +91,7 @@ def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:
         increments, text = feed / (shaft_revs or 1), f"0x6092 = {feed}/{shaft_revs or 1}"
     elif (count_rad := _angle_rad(position_unit)) is not None:
         increments, text = math.tau / count_rad * ratio, f"0x60A8 x 0x6091 = 0x{position_unit:08X} x {ratio_text}"
-    velocity = _velocity_rad_s(velocity_unit, increments, ratio)
+    velocity = velocity_rad_s(velocity_unit, increments, ratio)
     return DriveUnits(gear, increments, text, velocity, velocity_unit or 0)
 
 
@@ -100,7 +103,7 @@ def _angle_rad(unit: int | None) -> float | None:
     return None if angle_rad is None else angle_rad * 10.0 ** unit_prefix(unit)
 
 
-def _velocity_rad_s(unit: int | None, increments: float | None, gear_ratio: float) -> float | None:
+def velocity_rad_s(unit: int | None, increments: float | None, gear_ratio: float) -> float | None:
     """Return one count of a velocity unit at the joint, rad/s; None for another unit, or increments of unknown size.
 
     increments: per revolution of the joint; None or 0: unknown. gear_ratio: for units of an angle, which are the

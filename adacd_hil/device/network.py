@@ -163,7 +163,7 @@ class Master(EventSource):
                 f"the device was changed, or moved to another joint: correct `serial` of {slave.device.profile.name}",
             )
         if profile.contract_object:
-            self._check_contract(slave)
+            self.check_contract(slave)
         return Identity(slave.name, slave.node_id, *read.values())
 
     @staticmethod
@@ -193,8 +193,11 @@ class Master(EventSource):
                 f'get the EDS of this firmware from the maker; `identity = "any"` in {name} takes every revision',
             )
 
-    def _check_contract(self, slave: Slave) -> None:
-        """Raise DeviceError unless the device has the DBC's wire version and layout digest in 0x2000."""
+    def check_contract(self, slave: Slave) -> None:
+        """Raise DeviceError unless the device has the DBC's wire version and layout digest in 0x2000.
+
+        Raises DeviceError also if it can't be read, BusError if the bus fails.
+        """
         version, digest = slave.read(0x2000, 1), slave.read(0x2000, 2)
         if version != self._codec.wire_version:
             slave.fail(f"wire version {version} is not the DBC's {self._codec.wire_version}", _SAME_DBC)

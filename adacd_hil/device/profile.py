@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from adacd_hil.device.canopen_bus import ANSWER_TIMEOUT_S, EdsVariable, find_variable
 from adacd_hil.device.drive_units import LEAST_INCREMENTS
-from adacd_hil.remedies import nearest_name
+from adacd_hil.remedies import hint
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError, setting
 from adacd_hil.wire.e2e import PROFILES_BY_CODE
@@ -427,9 +427,7 @@ class ProfileSettings:
         known = [f"{name}.{field.name}" for name in MERGED for field in dataclasses.fields(type(getattr(self, name)))]
         for key in self.assumed:
             if key not in known:
-                nearest = nearest_name(key, known)
-                hint = f"; did you mean {nearest!r}?" if nearest else f"; known: {', '.join(known)}"
-                raise ValueError(f"assumed: {key!r} is no key of a profile{hint}")
+                raise ValueError(f"assumed: {key!r} is no key of a profile; {hint(key, known)}")
 
     def unit_of(self, signal: SignalSettings) -> tuple[float, str]:
         """Return (value of one count, unit) of a signal, by `scale` or else by the signal's own settings.

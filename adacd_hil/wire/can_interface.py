@@ -47,24 +47,11 @@ class CanInterface:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self._folder = _INTERFACES / name
-
-    @property
-    def is_up(self) -> bool:
-        """Whether the interface is present and up."""
-        return bool(self._number("flags", 16) & _IFF_UP)
 
     @property
     def is_virtual(self) -> bool:
         """Whether the interface certainly has no controller, which could hold frames: it is vcan or vxcan."""
         return is_virtual("socketcan", self.name)
-
-    def _number(self, file: str, base: int) -> int:
-        """Return the number in a file of the interface in sysfs; 0 without the file."""
-        try:
-            return int((self._folder / file).read_text(), base)
-        except OSError:
-            return 0
 
     def problem(self, is_fd: bool) -> str:
         """Return the reason why the interface can't be used, with the remedy, in one line; "" if it can be used.
@@ -77,13 +64,13 @@ class CanInterface:
             nearest = nearest_name(self.name, present)
             hint = f"; did you mean {nearest!r}?" if nearest else ""
             return f"CAN interface {self.name} does not exist; {known}{hint}"
-        if not self.is_up:
+        state = read_sysfs_link(_INTERFACES / self.name)
+        if state is None or not state.is_up:
             return f"CAN interface {self.name} is down; bring it up: ip link set {self.name} up"
-        mtu = self._number("mtu", 10)
-        if is_fd and mtu < CANFD_MTU:
+        if is_fd and state.mtu < CANFD_MTU:
             bit_rates = f"mtu {CANFD_MTU}" if self.is_virtual else "type can bitrate 1000000 dbitrate 5000000 fd on"
             return (
-                f"CAN interface {self.name} carries classic frames only (MTU {mtu}, CAN FD needs {CANFD_MTU}): "
+                f"CAN interface {self.name} carries classic frames only (MTU {state.mtu}, CAN FD needs {CANFD_MTU}): "
                 f"ip link set {self.name} down && ip link set {self.name} {bit_rates} && ip link set {self.name} up"
             )
         return ""

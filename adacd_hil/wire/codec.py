@@ -1,10 +1,9 @@
-"""The cyclic codec: bytes to physical values and back, by the tables of a contract.
+"""The cyclic codec: bytes to physical values, and raw integers to bytes, by the tables of a contract.
 
 A frame is decoded all or nothing: `adacd_hil.wire.e2e` first checks its length, then (for protected messages) CRC and
 counter. `adacd_hil.wire.dbc_contract` makes a codec from a DBC.
 """
 
-import math
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class CodecError(ValueError):
-    """A DBC that can't serve as the contract, or a value that doesn't fit its signal; one line."""
+    """A DBC that can't serve as the contract, or a frame that doesn't fit its message; one line."""
 
 
 class MessageCodec(MessageTable):
@@ -82,19 +81,6 @@ class MessageCodec(MessageTable):
         profile = self.profile
         return E2eReceiver() if profile is None else ProtectedReceiver(profile, self.data_ids, self.length)
 
-    def encode(self, *values: float) -> bytearray:
-        """Return a frame of finite physical values in the order of `values`; the end-to-end header is left zero.
-
-        Raises CodecError when a value doesn't fit or the number of values is wrong.
-        """
-        if len(values) != len(self.values):
-            raise CodecError(f"{self.name} takes {len(self.values)} values, {len(values)} given")
-        containers = [0] * (1 + max((signal.container for signal in self.signals), default=-1))
-        for signal, value in zip(self.values, values, strict=True):
-            raw = _quantise(signal, value)
-            containers[signal.container] |= (raw & signal.mask) << signal.shift if signal.mask else raw
-        return bytearray(self.containers.pack(*containers))
-
     def decode(self, data: bytes) -> tuple[float, ...]:
         """Return the physical values of all signals, in the order of `signals`.
 
@@ -129,23 +115,10 @@ class MessageCodec(MessageTable):
         doesn't fit its container.
         """
         if self._body is None:
-            raise CodecError(f"{self.name} has bit fields: encode physical values instead")
+            raise CodecError(f"{self.name} has bit fields, which no raw integers are packed into")
         frame = bytearray(self.length)
         self._body.pack_into(frame, self._body_offset, *raw)
         return frame
-
-
-def _quantise(signal: SignalCodec, value: float) -> int:
-    """Return a physical value as the signal's raw integer, rounded.
-
-    Raises CodecError for a value outside the signal's range, NaN and infinity included.
-    """
-    exact = (value - signal.offset) / signal.scale
-    if not (math.isfinite(exact) and signal.raw_low <= round(exact) <= signal.raw_high):
-        low, high = (bound * signal.scale + signal.offset for bound in (signal.raw_low, signal.raw_high))
-        unit = f" {signal.unit}" if signal.unit else ""
-        raise CodecError(f"{signal.name} = {value:g}{unit} must be within {low:g}{unit} to {high:g}{unit}")
-    return round(exact)
 
 
 class Codec:

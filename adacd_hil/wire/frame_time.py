@@ -5,6 +5,7 @@ CAN FD, see `adacd_hil.wire.frame_bits`.
 """
 
 from collections.abc import Callable
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -138,13 +139,9 @@ def worst_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
 
     That function raises ValueError for a length that no frame has. Frames of more than 8 bytes need `data_bitrate`.
     """
-    by_length: dict[tuple[int, bool], int] = {}
 
-    def time_ns(can_id: int, data: bytes) -> int:
-        key = (len(data), can_id > MAX_STANDARD_ID)
-        found = by_length.get(key)
-        if found is None:
-            found = by_length[key] = worst_case_frame(*key).duration_ns(bitrate, data_bitrate)
-        return found
+    @cache
+    def longest_ns(length: int, is_extended: bool) -> int:
+        return worst_case_frame(length, is_extended).duration_ns(bitrate, data_bitrate)
 
-    return time_ns
+    return lambda can_id, data: longest_ns(len(data), can_id > MAX_STANDARD_ID)

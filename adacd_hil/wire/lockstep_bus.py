@@ -17,7 +17,7 @@ monotonic clock.
 """
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Final
 
 from adacd_hil.clock import MonotonicClock, VirtualClock
@@ -127,19 +127,6 @@ class LockstepBus(Bus):
                 )
         self._count += 1
         self._queue.append((can_id, self._count, now_ns, data))
-
-    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Queue some frames at the clock's present time, one by one if not all fit into the queue.
-
-        Raises TransmitQueueError, SilenceError or BusError as `send`.
-        """
-        if not self._is_attached or len(self._queue) + len(frames) > self._queue_length:
-            super().send_all(frames)
-            return
-        now_ns = self._clock.now_ns()
-        for can_id, data in frames:
-            self._count += 1
-            self._queue.append((can_id, self._count, now_ns, data))
 
     def receive(self, timeout_s: float) -> Frame | None:
         """Return the next frame, with the clock at its end unless that is past; or None, the clock after `timeout_s`.

@@ -15,7 +15,7 @@ import can
 
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.extras import pip_command
-from adacd_hil.remedies import nearest_name
+from adacd_hil.remedies import hint
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError, Frame
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, MAX_STANDARD_ID
 
@@ -51,10 +51,7 @@ class PythonCanBus(Bus):
         if interface in _ECHOING_INTERFACES:
             raise BusMissingError(f"interface {interface} echoes own frames and can't carry a cycle; use socketcan")
         if interface not in can.VALID_INTERFACES:
-            known = interface_names()
-            nearest = nearest_name(interface, known)
-            hint = f"did you mean {nearest!r}?" if nearest else f"known: {', '.join(known)}"
-            raise BusMissingError(f"unknown interface {interface!r}; {hint}")
+            raise BusMissingError(f"unknown interface {interface!r}; {hint(interface, interface_names())}")
         self.channel = channel
         self._interface = interface
         self._clock = clock

@@ -24,8 +24,7 @@ import numpy as np
 
 from adacd_hil.log.log_files import SCENARIO_NAME, find_parts
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.log.types.topics import ChannelId
-from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT, pack_truth, truth_channels
+from adacd_hil.log.types.truth_topic import TRUTH, TRUTH_LAYOUT, truth_channels
 from adacd_hil.records import Event, Vector
 from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.time_marks import NEVER_NS, MarkKind, unpack_mark
@@ -114,7 +113,7 @@ class TruthLog(Recorder):
         t_ns: without the log's epoch. With a full ring it waits if the log is `blocking`, else it drops and counts the
         cycle.
         """
-        self.cycle(t_ns, ((ChannelId.TRUTH, pack_truth(cycle, block)),))
+        self.cycle(t_ns, ((TRUTH.id, TRUTH.pack(cycle, block=block)),))
 
     def write_event(self, t_ns: int, level: str, name: str, text: str) -> None:
         """Log the beginning or end of a fault as an event. `level`: info, warning or error.

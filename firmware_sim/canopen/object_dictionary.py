@@ -411,13 +411,14 @@ class ObjectDictionary:
         return self.value(index, subindex) if self.has(index, subindex) else default
 
     def default_or(self, default: int, index: int, subindex: int = 0) -> int:
-        """Return the default of a numeric object by EDS and description, whatever has been written since.
+        """Return a numeric object's default by EDS and description, by a DCF its ParameterValue, whatever was written.
 
-        It is `default` if the device lacks the object, or if neither gives it one.
+        It is `default` if the device lacks the object, or if none of them gives it one.
         """
         if not self.has(index, subindex):
             return default
-        value = self.find(index, subindex).default
+        variable = self.find(index, subindex)
+        value = variable.default if variable.value is None else variable.value
         return default if value is None else int(value)
 
     def take_over(self, index: int, subindex: int, value: int) -> bool:

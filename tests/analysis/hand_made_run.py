@@ -17,8 +17,8 @@ from adacd_hil.lab.score.run_arrays import (
 )
 from adacd_hil.log.logged_run import Truth
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_cycle, pack_scheme
-from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT, pack_truth, truth_channels
+from adacd_hil.log.types.topics import CYCLE, ChannelId, pack_contact, pack_scheme
+from adacd_hil.log.types.truth_topic import TRUTH, TRUTH_LAYOUT, truth_channels
 from adacd_hil.records import ContactReport, CycleRecord, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import layout_of
 from adacd_hil.settings.configuration import Settings
@@ -243,7 +243,7 @@ def record(path: Path, run: Run, attachments: dict[str, bytes] | None = None, cl
             times = CycleRecord(*(int(run.timing[name][row]) for name in CycleRecord._fields))
             messages = [
                 (ChannelId.SCHEME, pack_scheme(output, Request.NONE)),
-                (ChannelId.CYCLE, pack_cycle(times)),
+                (ChannelId.CYCLE, CYCLE.pack(*times)),
             ]
             messages += [(ChannelId.CONTACT, pack_contact(report)) for report in run.reports if report.cycle == cycle]
             recorder.cycle(int(run.t_ns[row]), messages)
@@ -260,4 +260,4 @@ def record_truth(path: Path, run: Run) -> None:
             block[TRUTH_LAYOUT.slices["contact_index"]] = run.truth.contact_index[row]
             block[TRUTH_LAYOUT.slices["payload"]] = run.truth.payload_kg[row]
             block[TRUTH_LAYOUT.slices["theta"]] = run.truth.theta[row]
-            recorder.cycle(int(run.t_ns[row]), [(ChannelId.TRUTH, pack_truth(cycle, block))])
+            recorder.cycle(int(run.t_ns[row]), [(ChannelId.TRUTH, TRUTH.pack(cycle, block=block))])

@@ -127,7 +127,7 @@ REFUSED = {
     ),
     "another arm": (
         lambda: changed(states(), names=("pan", "lift", "wrist")),
-        "/joint_states has no joint 'elbow'; it has pan, lift, wrist (`columns.q` names them)",
+        "/joint_states has no joint 'elbow'; known: pan, lift, wrist (`columns.q` names them)",
     ),
     "a name that is nearly right": (
         lambda: changed(states(), names=("pan", "lift", "Elbow_")),
@@ -160,7 +160,7 @@ def test_a_topic_of_the_map_that_a_bag_lacks_names_the_nearest(tmp_path):
     (tmp_path / "arm.urdf").write_text(ARM)
     (tmp_path / "map.toml").write_text('[arm]\nurdf = "arm.urdf"\n[bag]\ntopic = "/joint_state"\n')
     path = write_mcap(tmp_path / "r.mcap", states())
-    with pytest.raises(ConfigError, match="did you mean /joint_states"):
+    with pytest.raises(ConfigError, match="did you mean '/joint_states'"):
         read_recording(path, read_map(tmp_path / "map.toml"))
 
 

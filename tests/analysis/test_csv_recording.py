@@ -90,6 +90,10 @@ FORMS = {
         ['[csv]\ndelimiter = " "'],
     ),
     "a comment before the heads": (table(plain, "# t,angle,torque\n"), []),
+    "the same as numpy.savetxt writes it": (
+        table(lambda k, q, tau: f"{0.005 * k:.18e} {q:.18e} {tau:.18e}", "# t angle torque\n"),
+        ['[csv]\ndelimiter = " "'],
+    ),
     "a delimiter at the end of each row": (table(lambda *row: plain(*row) + ",", "t,angle,torque,\n"), []),
     "a numbered time, beside a period": (table(plain), ['time = "t" -> time = "1"', "[sampling]\nperiod_s = 0.005"]),
     "empty lines": (table(plain, "t,angle,torque\n\n") + "\n\n", []),

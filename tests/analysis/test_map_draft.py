@@ -112,8 +112,16 @@ def test_columns_without_heads_are_found_by_their_slopes(tmp_path, motion):
 
 def test_semicolons_decimal_commas_and_lines_above_the_head_are_found(tmp_path, motion):
     rows = table("", motion.t, motion.q, motion.tau, delimiter=";", form="{:.5f}".format).replace(".", ",")
-    _, keys = draft(tmp_path, f"Recorder 3.1\nArm;left\nt;q1;q2;tau1;tau2\ns;deg;deg;Nm;Nm\n{rows}")
-    assert keys["csv"] == {"delimiter": ";", "decimal": ",", "skip_rows": 2}
+    _, keys = draft(tmp_path, f'Recorder 3.1\n"Arm\nleft"\nt;q1;q2;tau1;tau2\ns;deg;deg;Nm;Nm\n{rows}')
+    assert keys["csv"] == {"delimiter": ";", "decimal": ",", "skip_rows": 3}
+    assert keys["units"] == {"q": "deg"}
+
+
+def test_heads_that_numpy_savetxt_writes_as_a_comment_are_found(tmp_path, motion):
+    text = table("# t q1 q2 tau1 tau2\n# s deg deg Nm Nm", motion.t, motion.q, motion.tau, delimiter=" ")
+    _, keys = draft(tmp_path, text)
+    assert keys["csv"] == {"delimiter": " "}
+    assert keys["columns"] == {"time": "t", "q": ["q1", "q2"], "tau_J": ["tau1", "tau2"]}
     assert keys["units"] == {"q": "deg"}
 
 
@@ -127,7 +135,9 @@ def test_dates_are_found_and_tell_the_interval_of_the_rows(tmp_path, motion):
 
 
 def test_a_period_that_nobody_says_is_left_to_be_written(tmp_path, motion):
-    _, keys = draft(tmp_path, table("q1,q2,tau1,tau2", motion.q, motion.tau))
+    heads = "T1 [Nm],T2 [Nm],i1 [A],i2 [A],q1 [rad],q2 [rad]"
+    _, keys = draft(tmp_path, table(heads, motion.tau, motion.tau, motion.q))
+    assert keys["columns"] == {"q": ["q1 [rad]", "q2 [rad]"], "tau_J": ["T1 [Nm]", "T2 [Nm]"]}
     assert keys["sampling"] == {"period_s": 0.0}
     played = called("identify", tmp_path / "r.csv", "--map", tmp_path / "map.toml")
     assert played.exit_code == 2

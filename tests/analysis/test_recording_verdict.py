@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from called import called
 from foreign_arms import AXES, Motion, record, rigid_torque, urdf_text, write_recording
+from joint_state_bags import State, write_mcap
 from scipy.integrate import solve_ivp
 
 from adacd_hil.lab.offline.column_checks import CORRECT_UNITS
 from adacd_hil.lab.offline.recording_identification import Identified, identify
 from adacd_hil.lab.offline.recording_import import read_recording
 from adacd_hil.lab.offline.recording_map import read_map
+from adacd_hil.lab.offline.recording_verdict import Verdict
 from adacd_hil.lab.serial_arm.urdf import read_urdf
 
 LEVEL, UPRIGHT = ("0 0 1",) * 7, ("0 1 0",) * 7
@@ -277,13 +279,13 @@ def test_a_wrong_model_says_how_far_it_is_off(tmp_path, upright):
     assert "`arm.has_rotors` = true" in motors.remedy
 
 
-def test_friction_that_drives_and_a_negative_term_of_it_are_said(tmp_path, upright):
+def test_friction_that_is_negative_is_said_with_both_terms(tmp_path, upright):
     compensated = replace(upright, tau=upright.tau - 2.0 * upright.truth["F_c"] * np.sign(upright.dq))
     verdict = judged(tmp_path, compensated, has_dq=True).verdict
-    assert any(remark.startswith("friction drives joint1 on: F_v ") for remark in verdict.remarks)
+    assert any(re.match("friction of joint1 is negative: F_v .*, F_c -0.5", remark) for remark in verdict.remarks)
     curved = replace(upright, tau=upright.tau - 0.5 * upright.truth["F_v"] * upright.dq * 3.0)
     verdict = judged(tmp_path, curved, has_dq=True).verdict
-    assert any(remark.startswith("F_v1 of joint1 is negative, -0.1") for remark in verdict.remarks)
+    assert any(remark.startswith("friction of joint1 is negative: F_v -0.1") for remark in verdict.remarks)
 
 
 def test_an_inertia_that_no_masses_make_is_said(tmp_path, level):
@@ -510,6 +512,13 @@ def test_torques_of_a_third_of_what_the_masses_need_are_a_remark(tmp_path, uprig
     assert any(remark.startswith("the torques are 0.4") for remark in verdict.remarks)
 
 
+@pytest.mark.parametrize("joint", [0, 1])
+def test_whichever_joint_has_no_torque_in_the_test_the_others_tell_the_unit(tmp_path, upright, joint):
+    tau = 1e3 * upright.tau
+    tau[1430:, joint] = 0.0
+    assert "they are mNm" in judged(tmp_path, replace(upright, tau=tau)).verdict.reasons[0]
+
+
 def test_masses_of_a_urdf_that_are_none_make_no_verdict(tmp_path, upright):
     """Some have a thousandth of a kilogram to please a simulator."""
     verdict = judged(tmp_path, upright, density=1e-3).verdict
@@ -560,6 +569,25 @@ def test_noise_of_velocities_that_hides_contacts_is_a_remark(tmp_path, upright):
     noisy = replace(upright, dq=upright.dq + 1.0 * np.random.default_rng(5).standard_normal(upright.dq.shape))
     verdict = judged(tmp_path, noisy, has_dq=True).verdict
     assert any("noise of the velocities, 1 rad/s, hides contacts" in remark for remark in verdict.remarks)
+
+
+def test_velocities_of_a_bag_are_measured_though_no_key_names_them(tmp_path, upright):
+    write_recording(tmp_path, urdf_text(2, UPRIGHT), upright)
+    (tmp_path / "map.toml").write_text('[arm]\nurdf = "arm.urdf"\n')
+    described, names = read_map(tmp_path / "map.toml"), ("joint1", "joint2")
+
+    def judged_bag(motion: Motion) -> Verdict:
+        rows = zip(*(values.tolist() for values in (motion.t, motion.q, motion.dq, motion.tau)), strict=True)
+        path = write_mcap(tmp_path / "r.mcap", [State(t, names, *values) for t, *values in rows])
+        return identify(described, [read_recording(path, described)], None).verdict
+
+    mixed = judged_bag(times(q=1 / DEGREE)(upright))
+    assert mixed.reasons[0].startswith("the positions are degrees")
+    turned = judged_bag(times(dq=TURNED)(upright))
+    assert turned.reasons[0].startswith("the velocity of joint2 has the other sign")
+    assert "of a bag `velocity` in its messages" in turned.remedy
+    noisy = judged_bag(replace(upright, dq=upright.dq + noise(upright.dq.shape) / 0.02))
+    assert any("noise of the velocities, 1 rad/s, hides contacts" in remark for remark in noisy.remarks)
 
 
 def test_joints_at_rest_are_named_in_one_reason(tmp_path):

@@ -206,27 +206,27 @@ def test_logs_of_two_arms_are_refused(monkeypatch, changes, error, words):
 @pytest.mark.long
 @compiled_only
 def test_where_a_log_is_cut_into_pieces_does_not_matter():
-    logs = {"a.mcap": log_of(30.0, tau_J=between(9_000, 9_001, np.nan)), "b.mcap": log_of(25.05, 2)}
+    logs = {"a.mcap": log_of(30.05, tau_J=between(9_000, 9_001, np.nan)), "b.mcap": log_of(25.05, 2)}
     one, other = statistics_of(logs, 10**6), statistics_of(logs, 777)
     np.testing.assert_array_equal(other.peaks, one.peaks)
     np.testing.assert_array_equal(other.z, one.z)
     assert (one.lag_s, one.hours) == (other.lag_s, other.hours)
-    assert len(one.peaks) == 551
+    assert len(one.peaks) == 301 + 251  # blocks begin anew with each log
 
 
 @pytest.mark.long
 @compiled_only
-def test_of_long_motion_some_windows_tell_the_lag_and_all_of_it_the_peaks(monkeypatch):
+def test_of_long_motion_some_pieces_tell_the_lag_and_all_of_it_the_peaks(monkeypatch):
     log = log_of(120.0, contact_joints=between(30_000, 70_000, 1))
     whole = statistics_of({"run.mcap": log})
     monkeypatch.setattr(module, "MOST_SAMPLES", 40_000)
-    thinned = statistics_of({"run.mcap": log})
+    thinned = statistics_of({"run.mcap": log}, 5_000)
     assert len(whole.z) == 120_000
-    assert len(thinned.z) == 40_000
-    assert thinned.is_free.sum() > 36_000, "windows are where nobody touched the arm"
+    assert len(thinned.z) == 30_000  # a third of the 80,000 in pieces without a touch, in whole pieces
+    assert thinned.is_free.sum() > 26_000, "pieces are where nobody touched the arm"
     np.testing.assert_allclose(thinned.lag_s, whole.lag_s, rtol=0.1)
     assert (thinned.hours, thinned.peaks.shape) == (whole.hours, whole.peaks.shape)
-    first_order = slice(0, 3)  # the likelihood's weights, and what the lag leaves, are those of the windows
+    first_order = slice(0, 3)  # the likelihood's weights, and what the lag leaves, are those of the pieces
     seen = ~np.isnan(whole.peaks[:, 0, 0])
     np.testing.assert_array_equal(~np.isnan(thinned.peaks[:, 0, 0]), seen)
     largest = [found.peaks[seen, first_order].max(axis=0) for found in (thinned, whole)]

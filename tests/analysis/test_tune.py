@@ -31,7 +31,6 @@ from adacd_hil.lab.tune.tune import (
 from adacd_hil.lab.tune.tune_candidates import (
     ShownLog,
     candidates,
-    chosen_blocks,
     observe_candidates,
     thresholds_as_changes,
 )
@@ -231,14 +230,6 @@ def test_the_paper_s_residual_is_taken_less_what_friction_may_hold_where_it_moni
     assert len(contact.since_s) == 50
     np.testing.assert_allclose(contact.statistic[0, 0], [200 / 399, 400 / 399 - 0.5])
     assert contact.since_s[-1] == pytest.approx(0.049)
-
-
-def test_a_block_of_joined_logs_is_for_choosing_as_its_first_cycle_is():
-    logs = [
-        SimpleNamespace(block=100, is_chosen_on=np.array(chosen), motion=SimpleNamespace(is_free=np.zeros(count)))
-        for count, chosen in ((250, [True, False, True]), (151, [False, True]))
-    ]
-    assert chosen_blocks(logs).tolist() == [True, False, True, False, True]
 
 
 def test_a_candidate_that_does_not_monitor_misses_the_contact_and_counts_no_motion():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from called import called
 from commission.tare_rig import HandledRig
+from loaded import encoded
 from own_arm import describe_arm, describe_geared_arm
 from rig import CODEC, Rig
 
@@ -121,7 +122,7 @@ def test_another_contract_is_told_and_stops_the_set_up(tmp_path):
     other.write_bytes(CODEC.text.replace(b"0|32@1- (5.9921124526782858e-06,0)", b"0|32@1- (5e-06,0)"))
     findings = doctor(rig, codec=load_codec(other))
     assert findings["contract"].status is Status.FAILED
-    assert "the DBC's are 1, 0x" in findings["contract"].reason
+    assert "is not the DBC's 0x" in findings["contract"].reason
     assert findings["set-up"].reason == "needs `contract`, which failed"
 
 
@@ -147,12 +148,16 @@ def test_a_pdo_map_that_is_not_the_contract_is_told(index, subindex, value, reas
 
 @pytest.mark.parametrize("describe", [describe_arm, describe_geared_arm])
 def test_devices_of_one_s_own_pass(tmp_path, describe):
-    """Sensors of 16 bits have their torque in 0x7130, and the drives theirs in objects of the maker, or in µNm."""
+    """Sensors of 16 bits have their torque in 0x7130, and the drives theirs in objects of the maker, or in µNm.
+
+    The maker's 0x2000 is no contract.
+    """
     written = called("init", *describe(tmp_path))
     assert written.exit_code == 0, written.stderr
     config = str(tmp_path / "my-arm.toml")
     played = rehearse(config, "idle")
     rig = Rig(load_settings(config), played.scenario, codec=played.codec, is_wall=True, contract=played.contract)
+    rig.bench.devices[0].serve(0x2000, 1, lambda: 7)
     findings = doctor(rig)
     assert statuses(findings, Status.FAILED) == []
     assert findings["PDO map"].status is Status.OK
@@ -238,12 +243,12 @@ def saturated(cycle: int, can_id: int, data: bytes) -> bytes:
 
 def moving(cycle: int, can_id: int, data: bytes) -> bytes:
     message = CODEC.message("Drive1Feedback")
-    return bytes(message.encode(message.decode_values(data)[0], 0.2)) if can_id == message.can_id else data
+    return bytes(encoded(message, message.decode_values(data)[0], 0.2)) if can_id == message.can_id else data
 
 
 def creeping(cycle: int, can_id: int, data: bytes) -> bytes:
     message = CODEC.message("Drive2Feedback")
-    return bytes(message.encode(message.decode_values(data)[0] + 1e-4 * cycle, 0.0)) if can_id == 0x182 else data
+    return bytes(encoded(message, message.decode_values(data)[0] + 1e-4 * cycle, 0.0)) if can_id == 0x182 else data
 
 
 def without_heartbeat(cycle: int, can_id: int, data: bytes) -> bytes | None:
@@ -307,6 +312,18 @@ def test_a_joint_moved_by_hand_tells_its_order_and_signs(speed_rad_s, torque_Nm,
     finding = doctor(rig, move_by_hand(rig, speed_rad_s, torque_Nm))["joint 1"]
     assert finding.status is status
     assert text in finding.reason
+
+
+def test_who_interrupts_learns_that_nodes_were_not_stopped(monkeypatch):
+    def interrupt(_: ArmExamination) -> Finding:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ArmExamination, "leave", lambda _: "lab is gone")
+    monkeypatch.setattr("adacd_hil.lab.cli.doctor_command.HOST_CHECKS", ())
+    monkeypatch.setattr("adacd_hil.lab.cli.doctor_command.ARM_CHECKS", [Check("nodes", interrupt)])
+    interrupted = called("doctor", "-i", "virtual", "-c", "lab")
+    assert interrupted.exit_code == 130
+    assert "nodes were not stopped: lab is gone; cut the drives' power" in interrupted.stderr
 
 
 def test_a_check_whose_prerequisite_failed_is_skipped_with_the_reason_behind_it():

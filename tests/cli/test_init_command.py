@@ -389,6 +389,29 @@ def test_profiles_are_drafted_from_eds_files_beside_the_configuration(out, tmp_p
     assert drafted.layout_digest == stock.layout_digest
 
 
+@pytest.mark.parametrize(
+    ("given", "stated"),
+    [
+        ("prof/own.toml", "../prof/own.toml"),
+        ("lab/own.toml", "own.toml"),
+        ("lab/prof/own.toml", "prof/own.toml"),
+        ("prof/own", "{there}/prof/own"),
+    ],
+)
+def test_a_profile_is_found_by_the_file_wherever_both_are(out, tmp_path, monkeypatch, given, stated):
+    own = tmp_path / given
+    own.parent.mkdir(parents=True)
+    own.with_name("base.toml").write_text('extends = "stock-drive"\nassumed = ["scale.gear_ratio"]\n')
+    own.write_text('extends = "base.toml"\n')
+    monkeypatch.chdir(tmp_path)
+    done = init(Path("lab/my-arm.toml"), *NO_BUS, "--json", "--drive", given, given)
+    assert done.exit_code == 0, done.stderr
+    assert f"{own.name}: scale.gear_ratio" in json.loads(done.stdout)["assumed"]
+    assert f'drive = ["{stated.format(there=tmp_path)}", ' in out.read_text()
+    monkeypatch.chdir("/")
+    assert [Path(name).resolve() for name in written(out).devices.drive] == [own, own]
+
+
 def test_an_eds_beside_named_profiles_of_its_kind_is_refused(out):
     words = ("--eds", str(contract_folder() / "stock_drive.eds"), "--drive", "maxon-epos4", "maxon-epos4")
     refused = init(out, *NO_BUS, *words)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from loaded import encoded
 from rig import CODEC, Rig
 
 from adacd_hil.device.device_files import place_devices
@@ -58,12 +59,12 @@ class HandledRig(Rig):
         message = CODEC.message(f"Drive{joint + 1}Feedback")
         position, velocity = message.decode_values(data)
         here, before = self.hand(cycle)[joint], self.hand(cycle - 1)[joint]
-        return bytes(message.encode(position + here, velocity + (here - before) / self.settings.bus.period_s))
+        return bytes(encoded(message, position + here, velocity + (here - before) / self.settings.bus.period_s))
 
     def _pushed(self, cycle: int, joint: int, data: bytes) -> bytes:
         message = CODEC.message(f"Sensor{joint + 1}Torque")
         (torque,) = message.decode_values(data)
-        frame = message.encode(torque + self.push(cycle, self.start_rad + self.hand(cycle))[joint])
+        frame = encoded(message, torque + self.push(cycle, self.start_rad + self.hand(cycle))[joint])
         frame[1] = data[1] & 0xF0
         return self._senders[joint].protect(frame)
 

@@ -3,6 +3,7 @@
 from typing import Any
 
 import pytest
+from loaded import encoded
 
 from adacd_hil.lab.commission.survey import BusView
 from adacd_hil.wire.bus import Frame
@@ -23,7 +24,7 @@ def by_name(described: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 def torque_frames(count: int) -> list[bytes]:
     sender = TORQUE.sender()
-    return [sender.protect(TORQUE.encode(0.001 * number)) for number in range(count)]
+    return [sender.protect(encoded(TORQUE, 0.001 * number)) for number in range(count)]
 
 
 def test_a_message_has_rate_age_and_the_values_of_its_last_frame():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from loaded import encoded
 from rig import PERIOD_NS, Rig
 
 from adacd_hil.device.drive import DISABLE_CYCLES
@@ -67,7 +68,7 @@ def test_an_enabled_test_is_good_only_of_drives_that_were_enabled(is_willing):
         if is_willing or not values:
             return data
         values[status.place("statusword")] = 0x40
-        return bytes(status.encode(*values))
+        return bytes(encoded(status, *values))
 
     rig.tamper = refuse
     loop = loop_of(rig, is_enabling=True)

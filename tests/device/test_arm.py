@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from loaded import encoded
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.device.arm import Arm
@@ -32,7 +33,7 @@ class Devices:
         self._senders: dict[str, E2eSender] = {n: CODEC.message(n).sender() for n in ("Sensor1Torque", "Sensor2Torque")}
 
     def send(self, name: str, *values: float) -> None:
-        frame = CODEC.message(name).encode(*values)
+        frame = encoded(CODEC.message(name), *values)
         data = self._senders[name].protect(frame) if name in self._senders else bytes(frame)
         self.arm.accept(Frame(CODEC.message(name).can_id, data, 0))
 
@@ -160,7 +161,7 @@ def test_signals_that_are_too_old_are_described_with_age_and_limit() -> None:
 def test_a_frame_with_the_same_counter_is_counted_as_repeated_and_answers_nothing() -> None:
     devices = Devices()
     can_id, sender = CODEC.message("Sensor1Torque").can_id, CODEC.message("Sensor1Torque").sender()
-    data = sender.protect(CODEC.message("Sensor1Torque").encode(1.5))
+    data = sender.protect(encoded(CODEC.message("Sensor1Torque"), 1.5))
     for cycle in range(3):
         devices.arm.synchronise(cycle, 0, 1)
         devices.arm.accept(Frame(can_id, data, 0))
@@ -186,8 +187,8 @@ def test_a_late_frame_is_of_the_cycle_before_skipped_periods_and_leaves_the_pres
     devices.arm.synchronise(75, 0, 75)
     feedback = CODEC.message("Drive1Feedback")
     status = CODEC.message("Drive1Status")
-    devices.arm.accept(Frame(feedback.can_id, bytes(feedback.encode(0.1, 0.01)), 0), is_late=True)
-    devices.arm.accept(Frame(status.can_id, bytes(status.encode(0x0237, 10, 0, 0)), 0), is_late=True)
+    devices.arm.accept(Frame(feedback.can_id, bytes(encoded(feedback, 0.1, 0.01)), 0), is_late=True)
+    devices.arm.accept(Frame(status.can_id, bytes(encoded(status, 0x0237, 10, 0, 0)), 0), is_late=True)
     assert (devices.arm.drives[0].sample_cycle, devices.arm.drives[0].status_cycle) == (0, 0)
     assert devices.arm.missing_frames == 4
     assert not devices.arm.has_all_frames

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 
 import pytest
-from loaded import loaded_contract
+from loaded import encoded, loaded_contract
 
 import adacd_hil
 from adacd_hil.device.device_files import load_profile
@@ -51,11 +51,11 @@ def drive(codec: Codec = CLASSIC, **options: int) -> Drive:
 
 
 def status(statusword: int, mode: int = 10, torque: int = 0, error: int = 0) -> bytes:
-    return bytes(CLASSIC.message("Drive1Status").encode(statusword, mode, torque, error))
+    return bytes(encoded(CLASSIC.message("Drive1Status"), statusword, mode, torque, error))
 
 
 def feedback(position_rad: float, velocity_rad_s: float) -> bytes:
-    return bytes(CLASSIC.message("Drive1Feedback").encode(position_rad, velocity_rad_s))
+    return bytes(encoded(CLASSIC.message("Drive1Feedback"), position_rad, velocity_rad_s))
 
 
 def in_state(state: Cia402State, mode: int = 10) -> Drive:
@@ -288,7 +288,7 @@ class Sender:
         self._sender = FD.message("Drive1Feedback").sender()
 
     def frame(self, *values: float) -> bytes:
-        return self._sender.protect(FD.message("Drive1Feedback").encode(*(values or FD_VALUES)))
+        return self._sender.protect(encoded(FD.message("Drive1Feedback"), *(values or FD_VALUES)))
 
 
 def test_protected_feedback_brings_motion_and_status_and_lets_torque_pass() -> None:
@@ -368,7 +368,7 @@ ERROR = '{ object = "0x603F", signal = "error_code" }'
 def test_the_status_may_travel_in_the_feedback(tmp_path: Path) -> None:
     codec = wide_contract(tmp_path, STATUS + MODE)
     arm = drive(codec)
-    frame = bytes(codec.message("Drive1Feedback").encode(2.5, 1.0, 0x0237, 10, 0x81))
+    frame = bytes(encoded(codec.message("Drive1Feedback"), 2.5, 1.0, 0x0237, 10, 0x81))
     assert arm.accept_cyclic(frame, 7)
     assert (arm.state, arm.mode, arm.status_cycle) == (Cia402State.OPERATION_ENABLED, 10, 7)
     assert (arm.has_status_frame, arm.status_message, arm.is_enabled) == (False, None, True)
@@ -382,7 +382,7 @@ def test_a_signal_of_the_status_may_be_the_first_of_its_frame(tmp_path: Path, fi
     arm = drive(wide_contract(tmp_path, "", status=rows))
     assert arm.status_message is not None
     raw = {"mode_display": 9, "torque_actual": -7, "error_code": 0x8130}
-    arm.accept_status(bytes(arm.status_message.encode(raw[first], 0x0237)), 2)
+    arm.accept_status(bytes(encoded(arm.status_message, raw[first], 0x0237)), 2)
     assert arm.state is Cia402State.OPERATION_ENABLED
     kept = {"mode_display": 10, "torque_actual": 0, "error_code": 0} | {first: raw[first]}
     assert (arm.mode, arm.torque_actual_permille, arm.error_code) == tuple(kept.values())
@@ -394,12 +394,12 @@ def test_the_status_may_travel_in_both_frames(tmp_path: Path) -> None:
     codec = wide_contract(tmp_path, torque + MODE, status=STATUS + ERROR)
     arm, feedback = drive(codec), codec.message("Drive1Feedback")
     assert arm.status_message is not None
-    arm.accept_status(bytes(arm.status_message.encode(0x0237, 0x8130)), 2)
-    assert arm.accept_cyclic(bytes(feedback.encode(0.5, 1.0, -7, 10, 0x81)), 3)
+    arm.accept_status(bytes(encoded(arm.status_message, 0x0237, 0x8130)), 2)
+    assert arm.accept_cyclic(bytes(encoded(feedback, 0.5, 1.0, -7, 10, 0x81)), 3)
     assert (arm.state, arm.statusword, arm.mode) == (Cia402State.OPERATION_ENABLED, 0x0237, 10)
-    arm.accept_status(bytes(arm.status_message.encode(0x0237, 0x8131)), 4)
+    arm.accept_status(bytes(encoded(arm.status_message, 0x0237, 0x8131)), 4)
     assert (arm.torque_actual_permille, arm.error_code, arm.shows_torque) == (-7, 0x8131, True)
-    assert arm.accept_cyclic(bytes(feedback.encode(0.5, 0.0, -8, 10, 0x81)), 5)
+    assert arm.accept_cyclic(bytes(encoded(feedback, 0.5, 0.0, -8, 10, 0x81)), 5)
     assert (arm.torque_actual_permille, arm.error_code, arm.status_cycle) == (-8, 0x8131, 5)
 
 
@@ -407,8 +407,8 @@ def test_an_implausible_frame_changes_no_status_either(tmp_path: Path) -> None:
     codec = wide_contract(tmp_path, STATUS + MODE)
     arm = drive(codec)
     feedback = codec.message("Drive1Feedback")
-    arm.accept_cyclic(bytes(feedback.encode(0.5, 0.0, 0x0237, 10, 0)), 0)
-    assert not arm.accept_cyclic(bytes(feedback.encode(1.5, 0.0, 0x0218, 10, 0)), 1)
+    arm.accept_cyclic(bytes(encoded(feedback, 0.5, 0.0, 0x0237, 10, 0)), 0)
+    assert not arm.accept_cyclic(bytes(encoded(feedback, 1.5, 0.0, 0x0218, 10, 0)), 1)
     assert arm.state is Cia402State.OPERATION_ENABLED
 
 
@@ -416,7 +416,7 @@ def test_without_a_mode_in_any_frame_the_masters_check_stands(tmp_path: Path) ->
     codec = wide_contract(tmp_path, STATUS + ERROR)
     arm = drive(codec)
     assert not arm.is_enabled
-    arm.accept_cyclic(bytes(codec.message("Drive1Feedback").encode(0.0, 0.0, 0x0237, 0)), 0)
+    arm.accept_cyclic(bytes(encoded(codec.message("Drive1Feedback"), 0.0, 0.0, 0x0237, 0)), 0)
     assert arm.is_enabled
 
 
@@ -424,7 +424,7 @@ def test_the_command_carries_limit_and_offset_where_the_contract_has_them(tmp_pa
     extra = '{ object = "0x60B2", signal = "torque_offset" }, { object = "0x6072", signal = "max_torque" },'
     codec = wide_contract(tmp_path, STATUS + ERROR, extra)
     arm = drive(codec, max_torque_permille=750)
-    arm.accept_cyclic(bytes(codec.message("Drive1Feedback").encode(0.0, 0.0, 0x0237, 0)), 0)
+    arm.accept_cyclic(bytes(encoded(codec.message("Drive1Feedback"), 0.0, 0.0, 0x0237, 0)), 0)
     frame = arm.command(-300, enable=True, quick_stop=False)
     assert codec.message("Drive1Command").decode_values(frame) == (0x0F, -300, 0, 750)
 

@@ -1,6 +1,7 @@
 """One joint torque sensor as the host sees it."""
 
 import pytest
+from loaded import encoded
 
 from adacd_hil.device.contract import compose
 from adacd_hil.device.device_files import place_devices
@@ -21,7 +22,7 @@ class Protected:
         self._sender = CODEC.message("Sensor1Torque").sender()
 
     def frame(self, torque: float, status: int = 0) -> bytes:
-        frame = CODEC.message("Sensor1Torque").encode(torque)
+        frame = encoded(CODEC.message("Sensor1Torque"), torque)
         frame[1] = status << 4
         return self._sender.protect(frame)
 
@@ -31,7 +32,7 @@ def unprotected(range_Nm: float = 0.0) -> TorqueSensor:
 
 
 def int32(torque: float) -> bytes:
-    return bytes(STOCK.message("Sensor1Torque").encode(torque))
+    return bytes(encoded(STOCK.message("Sensor1Torque"), torque))
 
 
 def test_a_valid_frame_is_taken_with_its_cycle_and_its_status() -> None:

@@ -5,6 +5,7 @@ import struct
 
 import pytest
 from bench_host import CODEC, EDS, Nmt
+from eds_variants import EdsVariant
 
 from adacd_hil.wire.dbc_contract import contract_folder
 from firmware_sim.canopen.error_control import Watchdog
@@ -119,10 +120,11 @@ def test_one_heartbeat_comes_after_missed_ones_and_the_next_in_its_place(host):
         assert len(host.taken(0x701)) == count
 
 
-def test_what_an_eds_gives_error_control_counts_from_the_first_power_on():
+@pytest.mark.parametrize("key", ["DefaultValue", "ParameterValue"])
+def test_what_an_eds_gives_error_control_counts_from_the_first_power_on(tmp_path, key):
     sent = []
-    defaults = {(0x1015, 0): 700, (0x1016, 1): 127 << 16 | 50, (0x1017, 0): 100}
-    described = DeviceDescription(contract_folder() / "drive.eds", defaults)
+    eds = EdsVariant("drive.eds").with_value(700, "1015", key=key).with_value(100, "1017", key=key)
+    described = DeviceDescription(eds.with_value(127 << 16 | 50, "1016sub1", key=key).write(tmp_path / "drive.eds"))
     device = EmulatedDevice(1, described, lambda can_id, _data: sent.append(can_id), CODEC.by_id, 8)
     device.power_on(0)
     device.on_heartbeat(127, 0)

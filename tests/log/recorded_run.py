@@ -15,7 +15,7 @@ from mcap_ros2.decoder import DecoderFactory
 from adacd_hil.log.mcap.record_layout import MESSAGE_HEAD
 from adacd_hil.log.reader import Series
 from adacd_hil.log.recording.recorder import LogSummary, Recorder
-from adacd_hil.log.types.topics import ChannelId, pack_arm, pack_contact, pack_control, pack_cycle, pack_scheme
+from adacd_hil.log.types.topics import CONTROL, CYCLE, ChannelId, pack_arm, pack_contact, pack_scheme
 from adacd_hil.records import (
     CONTROL_LAYOUT,
     ArmState,
@@ -70,8 +70,8 @@ class Cycle:
         messages = [
             (ChannelId.SCHEME, pack_scheme(self.output, self.request)),
             (ChannelId.ARM, pack_arm(self.arm, 5)),
-            (ChannelId.CONTROL, pack_control(self.output.cycle, self.control, self.gate_flags, True, False)),
-            (ChannelId.CYCLE, pack_cycle(self.record)),
+            (ChannelId.CONTROL, CONTROL.pack(self.output.cycle, self.gate_flags, True, False, block=self.control)),
+            (ChannelId.CYCLE, CYCLE.pack(*self.record)),
         ]
         if self.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(self.contact)))

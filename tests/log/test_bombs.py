@@ -70,7 +70,7 @@ def test_what_a_chunk_holds_is_had_again(compression, pack):
 @pytest.mark.parametrize(("compression", "pack"), PACKED.values(), ids=PACKED)
 def test_a_chunk_opens_to_so_many_bytes_and_no_more(compression, pack):
     assert len(decompress(compression, pack(bytes(MOST_BYTES)))) == MOST_BYTES
-    with pytest.raises(ChunkError, match=rf"(claims {MOST_BYTES + 1}|opens to more than {MOST_BYTES}) bytes|more than"):
+    with pytest.raises(ChunkError, match=f"opens to more than {MOST_BYTES} bytes"):
         decompress(compression, pack(bytes(MOST_BYTES + 1)))
 
 

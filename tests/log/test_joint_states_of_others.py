@@ -39,7 +39,8 @@ def test_the_check_finds_one_that_is_none(tmp_path: Path) -> None:
 
 
 def test_a_table_of_them_has_the_joints_names(tmp_path: Path) -> None:
-    (table,) = tables(write_mcap(tmp_path / "r.mcap", states()), tmp_path / "out").values()
+    without_names = State(0.6, (), (1.0,), (), ())
+    (table,) = tables(write_mcap(tmp_path / "r.mcap", [*states(), without_names]), tmp_path / "out").values()
     assert len(table) == 60
     assert (table[2]["position_lift"], table[2]["position_elbow"], table[2]["effort_pan"]) == ("2.0", "4.0", "6.0")
     assert table[2]["velocity_pan"] == "nan"

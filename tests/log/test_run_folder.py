@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from hang import HANG_S
 from mcap.writer import Writer
@@ -14,8 +15,10 @@ from adacd_hil.log.log_files import LogExistsError, part_path
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.run_folder import check_free
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.records import Event
 from adacd_hil.settings.run_settings import LogSettings
+from firmware_sim.bench.bench_time import TruthLog
 
 pytestmark = pytest.mark.slow  # each log starts a process
 
@@ -93,6 +96,16 @@ def test_the_log_of_a_start_that_failed_is_kept_aside(tmp_path):
     assert record(path, make_run(3)).is_complete
     assert [(tmp_path / f"failed-start-{number}.mcap").read_bytes() for number in (1, 2)] == failed
     assert len(read_log(path).scheme) == 3
+
+
+def test_the_emulator_s_log_of_a_start_that_failed_is_kept_aside_and_no_other(tmp_path):
+    path = tmp_path / "truth.mcap"
+    TruthLog(path, blocking=True).close()
+    with TruthLog(path, blocking=True) as log:
+        log.write(0, 0, np.zeros(TRUTH_LAYOUT.size))
+    assert (tmp_path / "failed-start-1.mcap").exists()
+    with pytest.raises(LogExistsError, match=f"^{path} is there already"):
+        check_free(path)
 
 
 def kill_host(path, before_death):

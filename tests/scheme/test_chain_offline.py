@@ -50,7 +50,7 @@ class Case:
         self.fitted = record_of(self.arm, 1, 8.0)
         self.unseen = record_of(self.arm, 2, 4.0)
         self.estimate = offline.identify(self.columns, self.fitted, self.before, SETTINGS)
-        self.certificate = offline.certify(self.columns, self.unseen, self.estimate, SETTINGS)
+        self.certificate = offline.certify(self.columns, [self.unseen], self.estimate, SETTINGS)
 
     def detect(self, record):
         return offline.detect(self.columns, record, self.estimate, SETTINGS, self.certificate.lack_Nm)
@@ -86,8 +86,8 @@ def test_noise_of_the_velocity_is_no_contact_and_raises_the_threshold_by_the_mas
     settings = dataclasses.replace(SETTINGS, velocity_noise_rad_s=1e-3)
     fitted, unseen = noisy
     estimate = offline.identify(case.columns, fitted, case.before, settings)
-    assert offline.certify(case.columns, unseen, estimate, SETTINGS).margin < 0.2
-    assert offline.certify(case.columns, unseen, estimate, settings).margin > 1.0
+    assert offline.certify(case.columns, [unseen], estimate, SETTINGS).margin < 0.2
+    assert offline.certify(case.columns, [unseen], estimate, settings).margin > 1.0
     still = Record(unseen.q[:1], np.zeros((1, 7)), unseen.tau_J[:1])
     M = mass_matrix(case.arm.chain, unseen.q[0], case.arm.theta_full)
     threshold = offline.detect(case.columns, still, estimate, settings).threshold[0]
@@ -103,8 +103,8 @@ def test_a_payload_is_one_unknown(case):
     first, rest = (Record(record.q[part], record.dq[part], record.tau_J[part]) for part in (np.s_[:500], np.s_[500:]))
     loaded = offline.with_payload(case.columns, case.estimate, 3.0, PAYLOAD_AT_M)
     estimate = offline.identify(case.columns, first, loaded, SETTINGS)
-    assert offline.certify(case.columns, rest, case.estimate, SETTINGS).margin < 0.01
-    assert offline.certify(case.columns, rest, estimate, SETTINGS).margin > 1.0
+    assert offline.certify(case.columns, [rest], case.estimate, SETTINGS).margin < 0.01
+    assert offline.certify(case.columns, [rest], estimate, SETTINGS).margin > 1.0
 
 
 def test_a_joint_at_standstill_may_hold_its_friction(case):
@@ -203,7 +203,7 @@ def test_the_filters_leave_the_noise_that_is_reckoned_with():
     still = np.zeros((60_000, 2))
     record = Record(still, still, 0.1 * rng.standard_normal(still.shape))
     zero = offline.ModelEstimate(np.zeros(len(columns.parameter_names)), np.zeros((len(columns.parameter_names),) * 2))
-    left = offline.filtered(columns, record, zero, settings)
+    left = offline.filtered(columns, [record], zero, settings)
     np.testing.assert_allclose(left.tau_f.std(axis=0), offline.filtered_noise_Nm(settings), rtol=0.1)
     np.testing.assert_array_equal(left.tau_f, -left.tau_ext_hat)
     assert left.unit[-1] == pytest.approx(1.0)

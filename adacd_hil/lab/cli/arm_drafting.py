@@ -28,7 +28,6 @@ from adacd_hil.lab.commission.arm_draft import (
     ArmFacts,
     Fact,
     PlanarArm,
-    assumed_keys,
     draft_arm,
     draft_as_toml,
     draw_arm,
@@ -72,12 +71,14 @@ _SHOWN_SHARE = 1e-5
 class DraftFiles:
     """Files to be written all together. Existing files stay unless `--force` is given, `is_forced`.
 
-    out: the configuration. contents: of the other files, by path.
+    out: the configuration. contents: of the other files, by path. named: paths of the given profiles, by their names in
+    the configuration.
     """
 
     out: Path
     is_forced: bool
     contents: dict[Path, bytes] = field(default_factory=dict)
+    named: dict[str, str] = field(default_factory=dict)
 
     def require_free(self, path: Path) -> None:
         """Raise CommandError if a file, folder or link is at the path, unless `--force` is given."""
@@ -100,31 +101,43 @@ class DraftFiles:
     def beside(self, name: str, kind: str) -> str:
         """Return a profile's name as the configuration states it: a built-in name, or a path relative to its folder.
 
-        If profile or EDS are in that folder, they are added unchanged to the files to be written. Raises ConfigError if
-        the profile can't be read.
+        A path without suffix, which no configuration looks for there, becomes absolute. If profile or EDS are in that
+        folder, they are added unchanged to the files to be written. Raises ConfigError if the profile can't be read.
         """
         profile = load_profile(name, kind)
         if name in profile_names():
             return name
+        folder = self.out.parent.resolve()
         for path in (Path(name), profile.eds):
-            if path.resolve().parent == self.out.resolve().parent:
+            if path.resolve().parent == folder:
                 self.contents[path] = path.read_bytes()
-        return os.path.relpath(name, self.out.parent)
+        place = Path(name).parent.resolve() / Path(name).name
+        stated = os.path.relpath(place, folder) if place.suffix else str(place)
+        self.named[stated] = str(place)
+        return stated
 
     def examine(self, text: str) -> ConfigurationFindings:
         """Check a configuration's text together with the added files, as `config check`; return the findings.
 
-        Likely mistakes name the files as they will be. Raises CommandError if it has errors. Writes to a temporary
-        folder only.
+        Given profiles are read where they are. Likely mistakes name the files as the configuration will. Raises
+        CommandError if it has errors. Writes to a temporary folder only.
         """
+        for name, place in self.named.items():
+            text = text.replace(toml_value(name), toml_value(place))
         with tempfile.TemporaryDirectory() as folder:
             for path, data in (self.contents | {self.out: text.encode()}).items():
                 (Path(folder) / path.name).write_bytes(data)
             found = examine_configuration(str(Path(folder) / self.out.name))
+
+        def as_stated(line: str) -> str:
+            for name, place in self.named.items():
+                line = line.replace(place, name)
+            return line.replace(f"{folder}/", "")
+
         if found.errors:
-            line = found.errors[0].replace(f"{folder}/", "")
+            line = as_stated(found.errors[0])
             raise CommandError(f"{self.out} is not written, as it could not be used: {line}", ExitCode.USAGE)
-        return found._replace(mistakes=[line.replace(f"{folder}/", "") for line in found.mistakes])
+        return found._replace(mistakes=[as_stated(line) for line in found.mistakes])
 
     def write_files(self, text: str) -> None:
         """Write the configuration, `text`, to `out`, and the added files, by name, into its folder, which is made.
@@ -184,7 +197,7 @@ class Drafting:
             "drive_node": list(facts.drive_node.value),
             "sensor": list(facts.sensor.value),
             "sensor_node": list(facts.sensor_node.value),
-            "assumed": [*assumed_keys(entries), *self._profile_guesses(facts)],
+            "assumed": list(found.guesses),
             "warnings": [*self.warnings, *warnings, *found.mistakes],
         }
         return text, summary
@@ -265,29 +278,14 @@ class Drafting:
                 )
 
     def _profile(self, kind: str, name: str, joint: int) -> ProfileSettings:
-        """Return the settings of a joint's profile: of its draft, else the built-in one, else the file.
+        """Return the settings of a joint's profile: of its draft, else the built-in one, else the given file.
 
-        joint: 0 or 1. A relative path counts from the output's folder.
+        joint: 0 or 1. name: as in the configuration.
         """
         draft = self._drafts.get((kind, joint))
         if draft is not None:
             return draft.settings
-        path = Path(name)
-        there = name if name in profile_names() or path.is_absolute() else str(self.writing.out.parent / path)
-        return load_profile(there, kind).settings
-
-    def _profile_guesses(self, facts: ArmFacts) -> list[str]:
-        """Return the guessed keys of drafted and built-in device profiles as "PROFILE: KEY", each once."""
-        keys: dict[str, None] = {}
-        for kind, names in ((DRIVE, facts.drive.value), (SENSOR, facts.sensor.value)):
-            for joint, name in enumerate(names):
-                guessed: Iterable[str] = ()
-                if name in profile_names():
-                    guessed = load_profile(name, kind).settings.assumed
-                elif (kind, joint) in self._drafts:
-                    guessed = self._drafts[kind, joint].guessed
-                keys |= dict.fromkeys(f"{name}: {key}" for key in guessed)
-        return list(keys)
+        return load_profile(self.writing.named.get(name, name), kind).settings
 
     # -- devices
 
@@ -586,9 +584,7 @@ class Drafting:
             if len(left) < len(profile.settings.assumed):
                 text = _extension(name, profile.settings.scale, draft.settings.scale, left)
                 completed[joint] = self._add_profile(text, name)
-                self._drafts[kind, joint] = draft._replace(
-                    guessed={key: draft.guessed[key] for key in left}, remarks=()
-                )
+                self._drafts[kind, joint] = draft
             else:
                 self.guessed.add(name)
         return tuple(completed)

@@ -27,7 +27,7 @@ from adacd_hil.lab.stated_bounds import GOOD_SHARE
 from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LAYOUT_NAME, SUFFIX, failing_as
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.run_folder import check_free
-from adacd_hil.log.types.topics import ChannelId, pack_cycle
+from adacd_hil.log.types.topics import CYCLE
 from adacd_hil.log.viewer_layout import viewer_layout
 from adacd_hil.plain_values import plain_values
 from adacd_hil.records import FaultReason
@@ -114,7 +114,7 @@ def _run(
     def observe(cycle: ZeroTorqueCycle) -> None:
         record = test.observe_cycle(cycle, 0 if recorder is None else recorder.waiting_bytes)
         if recorder is not None:
-            recorder.cycle(cycle.state.t_ns, [(ChannelId.CYCLE, pack_cycle(record))], cycle.frames)
+            recorder.cycle(cycle.state.t_ns, [(CYCLE.id, CYCLE.pack(*record))], cycle.frames)
 
     with on_interrupt(loop.interrupt):
         try:

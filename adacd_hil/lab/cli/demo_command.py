@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING
 
 from adacd_hil.cli.embedded_run import SCENARIO, resolve, run_embedded
 from adacd_hil.cli.output import CommandError, ExitCode, exit_code, run_folder
-from adacd_hil.control.session import LiveView, SessionSummary
+from adacd_hil.control.session import LiveView
 from adacd_hil.error_texts import error_text
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError
 from adacd_hil.progress_lines import Progress
-from adacd_hil.records import SchemeState
 
 if TYPE_CHECKING:
     from adacd_hil.lab.report.report_files import Report
@@ -58,24 +57,9 @@ def play(
             status = exit_code(summary)
             if status is ExitCode.OK:
                 raise
-            what = f"{_ending(summary)}; nor can the report be written: {error_text(error)}"
-            raise CommandError(what, status) from None
+            ending = summary.error or "the run did not end well"
+            raise CommandError(f"{ending}; nor can the report be written: {error_text(error)}", status) from None
         progress(f"report: {report.html_path}")
     if summary.error:
         raise CommandError(summary.error, exit_code(summary))
     return report, exit_code(summary)
-
-
-def _ending(summary: SessionSummary) -> str:
-    """Return a phrase on why a run, whose report could not be written, didn't end well.
-
-    The phrase names its error, or that no cycle was run; else the fault, the interruption, or the log that lacks data.
-    """
-    result = summary.result
-    if summary.error or result is None:
-        return summary.error or "no cycle was run"
-    if result.state is SchemeState.FAULT:
-        return f"the run ended in FAULT ({result.fault.name})"
-    if result.is_interrupted:
-        return "the run was interrupted"
-    return f"log {summary.log.path} lacks something"

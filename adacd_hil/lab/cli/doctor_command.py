@@ -30,9 +30,10 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
     """Run the checks of configuration, host and arm; return their findings and the exit status.
 
     A check is skipped if one that it needs has failed. The status is FAILURE if a check failed, else OK. The drives
-    stay disabled; nodes that were reset end pre-operational. Prints a line per finding meanwhile. is_moving: ask the
-    user to move joints by hand; without a terminal those checks are skipped. Raises ConfigError, CodecError if
-    configuration or contract can't be used, KeyboardInterrupt if the user interrupts.
+    stay disabled; nodes that were reset end pre-operational. Prints a line per finding meanwhile, and one at its end,
+    even by an error, if the nodes could not be stopped. is_moving: ask the user to move joints by hand; without a
+    terminal those checks are skipped. Raises ConfigError, CodecError if configuration or contract can't be used,
+    KeyboardInterrupt if the user interrupts.
     """
     settings, codec, devices = connection.load()
     bitrate, data_bitrate = read_bitrates(codec)
@@ -76,9 +77,10 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
             with on_interrupt(raise_interrupt):
                 findings += diagnose(ARM_CHECKS, patient, report, findings)
         finally:
-            trouble = patient.leave()
-    if trouble:
-        findings.append(Finding("end", Status.FAILED, f"nodes were not stopped: {trouble}", "cut the drives' power"))
+            if trouble := patient.leave():
+                end = Finding("end", Status.FAILED, f"nodes were not stopped: {trouble}", "cut the drives' power")
+                findings.append(end)
+                progress(f"{end.reason}; {end.remedy}")
     has_failed = any(finding.status is Status.FAILED for finding in findings)
     return findings, ExitCode.FAILURE if has_failed else ExitCode.OK
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.options import json_option, typed_again
+from adacd_hil.cli.options import json_option, stretch_options, typed_again
 from adacd_hil.cli.output import CommandError, ExitCode, answer, explain_statuses, explained, format_table, quoted, show
 from adacd_hil.file_access import write_new_file
 from adacd_hil.file_replacement import replace_file
@@ -21,6 +21,7 @@ from adacd_hil.settings.toml_text import toml_value
 if TYPE_CHECKING:
     from adacd_hil.lab.offline.recording_identification import Identified, Watched
     from adacd_hil.lab.offline.recording_import import ForeignRecording
+    from adacd_hil.log.time_window import TimeWindow
 
 
 _RECORDING = GivenPath()
@@ -40,48 +41,42 @@ _RECORDING = GivenPath()
 @click.option("--init", "is_init", is_flag=True, help="Write that map: --init RECORDING URDF.")
 @click.option("--test", type=_RECORDING, help="Recording to test on; default: the last part of the last one fitted.")
 @click.option("--watch", multiple=True, type=_RECORDING, help="Recording in which to look for contacts; repeatable.")
-@click.option("--from", "start_s", type=float, default=0.0, show_default=True, help="Fit from this time on, s.")
-@click.option("--until", "end_s", type=float, default=float("inf"), help="Fit until this time, s; default: the end.")
 @click.option("--out", type=WRITTEN_FOLDER, help="Folder for pictures and identify.json.")
 @json_option
 @explained
+@stretch_options
 def identify(
     recordings: tuple[Path, ...],
     map_path: Path | None,
     is_init: bool,
     test: Path | None,
     watch: tuple[Path, ...],
-    start_s: float,
-    end_s: float,
     out: Path | None,
     as_json: bool,
+    stretch: "TimeWindow",
 ) -> ExitCode:
     """Identify an arm from RECORDINGS of positions, torques and, if there are some, velocities: CSV, MCAP, rosbags.
 
-    RECORDINGS are of free motion. The verdict tells whether the model explains their torque, the reasons if not, and
-    the next step. With the model frozen, contacts are detected in the recordings of --watch. With --init a recording
-    and a URDF make a map; its guesses are listed.
+    RECORDINGS are of free motion; --from and --until choose a stretch of each. The verdict tells whether the model
+    explains their torque, the reasons if not, and the next step. With the model frozen, contacts are detected in the
+    recordings of --watch. With --init a recording and a URDF make a map; its guesses are listed.
     """
     from adacd_hil.lab.offline.recording_identification import identify as run
     from adacd_hil.lab.offline.recording_import import read_recording
     from adacd_hil.lab.offline.recording_map import read_map
-    from adacd_hil.log.time_window import TimeWindow
 
     if is_init:
         return _init(recordings, map_path)
     if map_path is None:
         raise CommandError("--map is missing; `adacd-hil identify --init RECORDING URDF` writes one", ExitCode.USAGE)
-    if not start_s < end_s:
-        raise CommandError(f"--from {start_s:g} s is not before --until {end_s:g} s", ExitCode.USAGE)
     described = read_map(map_path)
     with Progress() as progress:
         read: list[ForeignRecording] = []
         for place, path in enumerate((*recordings, *((test,) if test else ()), *watch)):
             progress(f"reading {path}")
-            # From 0 s on: no earlier part is left out.
-            span = TimeWindow(start_s or -math.inf, end_s) if place < len(recordings) else None
+            span = stretch if place < len(recordings) else None
             read.append(read_recording(path, described, read[0].period_s if read else 0.0, span))
-        fitted = [recording.between(start_s, end_s) for recording in read[: len(recordings)]]
+        fitted = [recording.between(*stretch) for recording in read[: len(recordings)]]
         tested = read[len(recordings)] if test else None
         progress(f"fitting {sum(recording.duration_s for recording in fitted):.1f} s")
         found = run(described, fitted, tested, read[len(recordings) + bool(test) :])

@@ -29,7 +29,7 @@ from adacd_hil.lab.commission.communication_test import (
 )
 from adacd_hil.lab.commission.host_checks import Check, Finding, failed, ok, skipped, warning
 from adacd_hil.lab.commission.profile_draft import POLARITIES
-from adacd_hil.lab.commission.survey import NMT_STATES, compare, read_number, survey
+from adacd_hil.lab.commission.survey import NMT_STATES, compare, survey
 from adacd_hil.lab.commission.tare import ArmMovedError, check_motion
 from adacd_hil.lab.commission.traffic import Traffic, listen
 from adacd_hil.records import JOINTS, ArmState, Vector
@@ -183,26 +183,20 @@ def boot_nodes(patient: ArmExamination) -> Finding:
 
 
 def check_contract(patient: ArmExamination) -> Finding:
-    """Fail if a device's wire version or layout digest, 0x2000, isn't that of the host's DBC.
+    """Compare wire version and layout digest, 0x2000, of each device whose profile has that object with the host's DBC.
 
-    The check is skipped if a device lacks 0x2000 and none differs. Raises DeviceError if a device refuses or doesn't
-    answer.
+    The check is skipped if the profile of a device lacks it and none differs. Raises DeviceError if a device differs,
+    refuses or doesn't answer, BusError if the bus fails.
     """
-    codec = patient.codec
     lacking = []
-    for name, node in patient.master.nodes.items():
-        version, digest = read_number(node, 0x2000, 1), read_number(node, 0x2000, 2)
-        if version is None or digest is None:
-            lacking.append(name)
-        elif (version, digest) != (codec.wire_version, codec.layout_digest):
-            return failed(
-                f"{name}: wire version {version}, layout digest 0x{digest:08X}; the DBC's are "
-                f"{codec.wire_version}, 0x{codec.layout_digest:08X}",
-                "give host and devices the same DBC file",
-            )
+    for slave in patient.master.slaves:
+        if slave.device.settings.contract_object:
+            patient.master.check_contract(slave)
+        else:
+            lacking.append(slave.name)
     if lacking:
         return skipped(f"{', '.join(lacking)} has no contract object 0x2000; the PDO map is compared instead")
-    return ok(f"wire version {codec.wire_version}, layout digest 0x{codec.layout_digest:08X}")
+    return ok(f"wire version {patient.codec.wire_version}, layout digest 0x{patient.codec.layout_digest:08X}")
 
 
 def set_up_nodes(patient: ArmExamination) -> Finding:

@@ -18,7 +18,14 @@ from typing import Any, NamedTuple
 from adacd_hil.device.canopen_bus import EdsVariable, find_variable
 from adacd_hil.device.device_files import load_profile, profile_names
 from adacd_hil.device.device_setup import CST_SUPPORTED, NEWTON_METRE
-from adacd_hil.device.drive_units import CREDIBLE_INCREMENTS, RPM, name_velocity_unit, read_drive_units, unit_prefix
+from adacd_hil.device.drive_units import (
+    CREDIBLE_INCREMENTS,
+    RPM,
+    name_velocity_unit,
+    read_drive_units,
+    unit_prefix,
+    velocity_rad_s,
+)
 from adacd_hil.device.eds_file import read_eds
 from adacd_hil.device.profile import (
     EVENT_TIMER,
@@ -101,8 +108,7 @@ class DeviceRatings(NamedTuple):
         result isn't plausible for a joint, as of a factory's 50000 rpm.
         """
         rpm = self.numbers.get((0x6080, 0))
-        gear = read_drive_units(lambda *place: self.numbers.get(place)).gear_ratio
-        gear = scale.gear_ratio if gear in (None, 1.0) else gear
+        gear = read_drive_units(lambda *place: self.numbers.get(place)).stated_gear_ratio or scale.gear_ratio
         degrees_s = (rpm or 0) * _DEG_S_PER_RPM / gear
         return degrees_s if _LEAST_LIMIT_DEG <= degrees_s <= _MOST_SPEED_DEG_S else None
 
@@ -587,15 +593,15 @@ class _DriveWriter(_ProfileWriter):
         unless that is 1 : 1, else a guess. A factory value of 0x6091 is stored as a guess, too, and so is an efficiency
         without an answer. There is no efficiency without a gear.
         """
-        by_drive = read_drive_units(self.number).gear_ratio
-        lines: list[str] = []
+        units = read_drive_units(self.number)
+        by_drive, lines = units.stated_gear_ratio, list[str]()
         if "gear_ratio" in self.answers:
             gear = self.answers["gear_ratio"]
-        elif by_drive not in (None, 1.0) and not self.is_factory(0x6091, 1):
-            gear = by_drive or 1.0
+        elif by_drive is not None and not self.is_factory(0x6091, 1):
+            gear = by_drive
         else:
-            gear = by_drive if by_drive not in (None, 1.0) else self._likely_gear(motor_Nm)
-            why = "0x6091 is a factory value" if by_drive is not None else "the EDS has no 0x6091"
+            gear = by_drive or self._likely_gear(motor_Nm)
+            why = "the EDS has no 0x6091" if units.gear_ratio is None else "0x6091 is a factory value"
             lines = [self.guess("gear_ratio", gear, f"{gear:g}: {why}")]
         text = [*lines, f"gear_ratio = {gear:.16g}"]
         if gear != 1.0:
@@ -653,8 +659,8 @@ class _DriveWriter(_ProfileWriter):
 
         It hides 0x6091 if that is 1 : 1, or if the user gave a gear.
         """
-        by_drive = read_drive_units(self.number).gear_ratio
-        is_set = by_drive not in (None, 1.0) and "gear_ratio" not in self.answers
+        by_drive = read_drive_units(self.number).stated_gear_ratio
+        is_set = by_drive is not None and "gear_ratio" not in self.answers
         return lambda index, sub: None if index == 0x6091 and not is_set else self.number(index, sub)
 
     def _velocity(self, gear: float, increments: float) -> list[str]:
@@ -666,10 +672,7 @@ class _DriveWriter(_ProfileWriter):
         """
         unit = self.answers.get("velocity_unit")
         code = int(unit) if unit is not None else self.number(0x60A9, 0)
-        objects = {(0x60A9, 0): code, (0x608F, 1): 1}
-        found = read_drive_units(lambda index, sub: objects.get((index, sub)), gear).velocity_rad_s
-        if code and code >> 16 & 0xFF == 0xB5 and found is not None:
-            found *= gear / increments
+        found = velocity_rad_s(code, increments, gear)
         if code and found is not None:
             return [f"# In {name_velocity_unit(code)} of the motor.", f"velocity_rad_s = {found!r}"]
         if (fact := self.fact("velocity_rad_s")) is not None:

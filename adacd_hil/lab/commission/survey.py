@@ -200,17 +200,17 @@ def _identify(canopen: CanopenBus, node: Node, has_contract: bool) -> None:
     try:
         name = read_object(remote, 0x1008)
         node.name = None if name is None else name.rstrip(b"\0").decode("ascii", "replace").strip()
-        node.error_register = read_number(remote, 0x1001)
+        node.error_register = _read_number(remote, 0x1001)
         for subindex, what in enumerate(_IDENTITY, start=1):
-            setattr(node, what, read_number(remote, 0x1018, subindex))
+            setattr(node, what, _read_number(remote, 0x1018, subindex))
         if has_contract:
-            node.wire_version = read_number(remote, 0x2000, 1)
-            node.layout_digest = read_number(remote, 0x2000, 2)
+            node.wire_version = _read_number(remote, 0x2000, 1)
+            node.layout_digest = _read_number(remote, 0x2000, 2)
     except DeviceError:
         node.answers = False  # it fell silent or refuses: values read so far stay
 
 
-def read_number(remote: Any, index: int, sub: int = 0) -> int | None:
+def _read_number(remote: Any, index: int, sub: int = 0) -> int | None:
     """Read an object of a node as an unsigned number, None if it is missing. Raises DeviceError as `read_object`."""
     data = read_object(remote, index, sub)
     return None if data is None else int.from_bytes(data, "little")

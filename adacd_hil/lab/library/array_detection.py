@@ -28,7 +28,7 @@ from adacd_hil.lab.serial_arm.urdf import STANDARD_GRAVITY_M_S2, SerialArm, read
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.robot_description import robot_description
 from adacd_hil.records import Vector
-from adacd_hil.remedies import nearest_name
+from adacd_hil.remedies import hint
 from adacd_hil.score.wording import number_of
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
@@ -291,10 +291,7 @@ def _named(arrays: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
     for given, values in arrays.items():
         name = _ALIASES.get(given, given)
         if name not in (*_REQUIRED, *_OPTIONAL):
-            near = nearest_name(str(given), _KNOWN)
-            raise ArrayError(
-                f"unknown array {given!r}; " + (f"did you mean {near!r}?" if near else f"known: {', '.join(_KNOWN)}")
-            )
+            raise ArrayError(f"unknown array {given!r}; {hint(str(given), _KNOWN)}")
         if name in named:
             raise ArrayError(f"array {name!r} is given twice, once as {given!r}")
         named[name] = values

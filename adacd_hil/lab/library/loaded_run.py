@@ -20,7 +20,7 @@ from adacd_hil.log.logged_run import settings_of
 from adacd_hil.log.reader import RunLog, each_once, read_log
 from adacd_hil.log.types.topics import CONTACT, CONTROL, CYCLE, EVENTS, SCHEME
 from adacd_hil.records import ContactReport, SchemeState, Vector
-from adacd_hil.remedies import nearest_name
+from adacd_hil.remedies import hint
 from adacd_hil.score.wording import number_of
 from adacd_hil.settings.configuration import Settings
 
@@ -83,9 +83,7 @@ class LoadedRun:
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Return an array by its name. Raises KeyError, with the nearest name, for an unknown one."""
         if name not in self.arrays:
-            near = nearest_name(name, self.arrays)
-            hint = f"did you mean {near!r}?" if near else f"there are {', '.join(self.arrays)}"
-            raise KeyError(f"no array {name!r}; {hint}")
+            raise KeyError(f"no array {name!r}; {hint(name, self.arrays)}")
         return self.arrays[name]
 
     def __iter__(self) -> Iterator[str]:

@@ -58,13 +58,14 @@ def joint_state_columns(payloads: Iterable[bytes]) -> Iterator[tuple[tuple[str, 
     """Yield the joints' names and a table of columns for each list of joints in messages of ROS 2.
 
     Columns: `t_ns` of the stamp, and `position_NAME`, `velocity_NAME`, `effort_NAME`; nan in a row whose message hasn't
-    one for each joint. Invalid payloads are left out.
+    one for each joint. Invalid payloads and messages without names are left out.
     """
     groups: dict[tuple[str, ...], list[JointStateMessage]] = {}
     for payload in payloads:
         with suppress(LogError):
             message = decode_joint_state(payload)
-            groups.setdefault(message.names, []).append(message)
+            if message.names:
+                groups.setdefault(message.names, []).append(message)
     for names, messages in groups.items():
         columns: dict[str, Any] = {"t_ns": np.array([message.stamp_ns for message in messages], np.int64)}
         for field in _FIELDS:

@@ -13,7 +13,7 @@ from adacd_hil.lab.offline.recorded_columns import RecordedColumns, RecordedRows
 from adacd_hil.lab.offline.recording_map import RecordingMap
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import TimeWindow
-from adacd_hil.remedies import nearest_name
+from adacd_hil.remedies import hint
 from adacd_hil.settings.schema import ConfigError
 
 
@@ -76,9 +76,7 @@ def _topic(path: Path, topics: Mapping[str, str], wanted: str) -> str:
     if wanted:
         if wanted in found:
             return wanted
-        near = nearest_name(wanted, found)
-        known = f"did you mean {near}?" if near else f"there are {', '.join(found) or 'none'}"
-        raise ConfigError(f"recording {path} has no topic {wanted} of {TYPE}; {known}")
+        raise ConfigError(f"recording {path} has no topic {wanted} of {TYPE}; {hint(wanted, found)}")
     if not found:
         there = ", ".join(f"{topic} ({kind})" for topic, kind in list(topics.items())[:6]) or "no topic at all"
         raise ConfigError(f"recording {path} has no topic of {TYPE}; it has {there}")
@@ -105,6 +103,4 @@ def _check_names(where: str, wanted: tuple[str, ...], places: Mapping[tuple[str,
             f"{where}: no message has all of {', '.join(wanted)}; record a topic that joins them, as of "
             "joint_state_publisher with `source_list`"
         )
-    near = nearest_name(lacking, there)
-    known = f"did you mean {near!r}?" if near else f"it has {', '.join(there) or 'no names'}"
-    raise ConfigError(f"{where} has no joint {lacking!r}; {known} (`columns.q` names them)")
+    raise ConfigError(f"{where} has no joint {lacking!r}; {hint(lacking, there)} (`columns.q` names them)")

@@ -60,6 +60,9 @@ BEYOND_EFFORT: Final = 30.0
 
 CORRECT_UNITS: Final = "correct `columns`, `units` and `scale` of positions and torques"
 CLIPPED_REMEDY: Final = "move slower, or raise the range of that sensor"
+LEFT_OUT_REMEDY: Final = (
+    "leave the velocities out (`columns.dq`; of a bag `velocity` in its messages): they are derived then"
+)
 
 
 class RecordingFinding(NamedTuple):
@@ -423,7 +426,7 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
             yield RecordingFinding(
                 f"the velocity of {column_name(described, 'dq', joint)} is in the column of "
                 f"{column_name(described, 'dq', other)}",
-                "in the map: exchange them in `columns.dq`, or leave that key out: velocities are derived then",
+                f"exchange them, or {LEFT_OUT_REMEDY}",
                 is_wrong=True,
             )
             return
@@ -435,7 +438,7 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
         keys = [f'`units.{key}` = "{unit}"' for key, unit in units_by_slope(described.units, abs(factor))]
         yield RecordingFinding(
             f"the velocity of {name} {how} its position's slope",
-            f"in the map: {' or '.join([*keys, 'leave `columns.dq` out'])}: velocities are derived then",
+            " or ".join([*(f"in the map: {key}" for key in keys), LEFT_OUT_REMEDY]),
             is_wrong=True,
         )
         return

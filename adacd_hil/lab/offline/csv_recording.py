@@ -22,7 +22,7 @@ from adacd_hil.lab.offline.recorded_columns import RecordedColumns, RecordedRows
 from adacd_hil.lab.offline.recording_map import ISO, TIME_S, RecordingMap, unit_of
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import TimeWindow
-from adacd_hil.remedies import nearest_name
+from adacd_hil.remedies import hint, nearest_name
 from adacd_hil.settings.schema import ConfigError
 
 DELIMITERS: Final = (",", ";", "\t", " ")
@@ -87,15 +87,11 @@ def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
 
 
 def _head(path: Path, first: list[str], described: RecordingMap) -> list[str]:
-    """Return the stripped cells of the first row, without empty ones at its end and without a "#" at its begin.
+    """Return the cells of the first row as of `head_of`.
 
     Raises ConfigError if the map says that there is a header, its delimiter gives one column, and another one over two.
     """
-    while first and not first[-1].strip():  # a delimiter at the end of every row
-        first = first[:-1]
-    heads = [cell.strip() for cell in first]
-    if heads:
-        heads[0] = heads[0].removeprefix("#").strip()
+    heads = head_of(first)
     if described.csv.has_header and len(heads) == 1:
         for delimiter in DELIMITERS:
             if delimiter != described.csv.delimiter and len(heads[0].split(delimiter)) > 2:
@@ -103,8 +99,21 @@ def _head(path: Path, first: list[str], described: RecordingMap) -> list[str]:
     return heads
 
 
+def trimmed(cells: list[str]) -> list[str]:
+    """Return the stripped cells of a row without empty ones at its end: a delimiter may end every row."""
+    while cells and not cells[-1].strip():
+        cells = cells[:-1]
+    return [cell.strip() for cell in cells]
+
+
+def head_of(cells: list[str]) -> list[str]:
+    """Return the cells of a head as of `trimmed`, without a "#" at its begin. Raises ValueError if all are empty."""
+    first, *others = trimmed(cells)
+    return [first.removeprefix("#").strip(), *others]
+
+
 def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]]:
-    """Yield each row's number in the file, from 1, and its cells.
+    """Yield the number of each row's last line in the file, from 1, and its cells.
 
     The first `csv.skip_rows` lines are skipped, but counted in the numbers. Empty rows are skipped, too. Raises
     LogError as `opened_text` and `split_rows`.
@@ -113,9 +122,9 @@ def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]
     with opened_text(path) as file:
         for _ in range(form.skip_rows):
             next(file, "")
-        for number, cells in enumerate(split_rows(path, file, form.delimiter), start=1 + form.skip_rows):
+        for number, cells in split_rows(path, file, form.delimiter):
             if any(map(str.strip, cells)):
-                yield number, cells
+                yield number + form.skip_rows, cells
 
 
 @contextmanager
@@ -138,14 +147,19 @@ def opened_text(path: Path) -> Iterator[TextIO]:
         raise LogError(f"recording {path}: {error.strerror or error}") from None
 
 
-def split_rows(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
-    """Yield the cells of each line; a delimiter " " is any white space. Raises LogError, with `path`, for bad CSV."""
+def split_rows(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of each row's last line, from 1, and its cells: a quoted cell may have several lines.
+
+    A delimiter " " is any white space, but none behind a "#" that begins the line, and quotes mean nothing then. Raises
+    LogError, with `path`, for bad CSV.
+    """
     if delimiter == " ":
-        yield from (line.split() for line in lines)
+        yield from enumerate((re.sub(r"^\s*#\s+", "#", line).split() for line in lines), start=1)
         return
     rows = csv.reader(lines, delimiter=delimiter)
     try:
-        yield from rows
+        for cells in rows:
+            yield rows.line_num, cells
     except csv.Error as error:
         raise LogError(f"recording {path}, row {rows.line_num}: {error}") from None
 
@@ -196,9 +210,7 @@ def _place(path: Path, name: str, heads: list[str], cells: int) -> int:
         return heads.index(name)
     if name.isdecimal() and 1 <= int(name) <= cells:
         return int(name) - 1
-    nearest = nearest_name(name, heads)
-    known = f"did you mean {nearest!r}?" if nearest else f"there are {', '.join(heads) or f'1 to {cells}'}"
-    raise ConfigError(f"recording {path} has no column {name!r}; {known}")
+    raise ConfigError(f"recording {path} has no column {name!r}; {hint(name, heads or (f'1 to {cells}',))}")
 
 
 def _numbers(

@@ -111,21 +111,27 @@ class _Equations(NamedTuple):
 
 
 def find_readings(
-    described: RecordingMap, model: ArmModel, settings: OfflineSettings, fitted: list[Record], tested: list[Record]
+    described: RecordingMap,
+    model: ArmModel,
+    settings: OfflineSettings,
+    fitted: list[Record],
+    tested: list[Record],
+    has_velocities: bool,
 ) -> list[Reading]:
     """Return the interpretations that explain the test's torque far better than the map does, best first.
 
     An arm can have their parameters, and they explain at least `EXPLAINED` of each joint's torque. They leave at most
     `_BETTER` of the share that the map leaves unexplained, unless no arm can have the map's parameters. Of nearly equal
     ones only those with the fewest differences from the map are returned. At most `_MOST_S` of fit and of test are
-    used. [] if there is none, or the map's own can't be computed.
+    used. [] if there is none, or the map's own can't be computed. has_velocities: they were measured, not derived.
     """
     fitted, tested = _thinned(fitted, settings), _thinned(tested, settings)
     step = _step(settings)
     settings = replace(settings, period_s=step * settings.period_s, fit_every=max(1, round(settings.fit_every / step)))
     units = [] if described.joints == 1 else list(_other_units(described, tested))
     tried: list[Reading] = []
-    for motion in itertools.chain(_motions(described, model), _late(described, model, settings.period_s)):
+    motions = _motions(described, model, has_velocities)
+    for motion in itertools.chain(motions, _late(described, model, settings.period_s)):
         if motion.late and not any(each.weight == 0 and each.unexplained > _LATE_ABOVE for each in tried):
             break
         fit, test = (_equations(part, settings, motion) for part in (fitted, tested))
@@ -291,12 +297,12 @@ def _torques(described: RecordingMap, most_turned: int, units: list[tuple[int, f
         yield _Torques(Nm / Nm[::-1], straight[::-1], text, remedy)
 
 
-def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
+def _motions(described: RecordingMap, model: ArmModel, has_velocities: bool) -> Iterator[_Motion]:
     """Yield interpretations of the motion, the map's own first, with texts "".
 
     The others: positions in another unit, a position with the other sign, two exchanged with and without their torques,
     sums or differences of neighbours, the other `arm.has_rotors`, gravity along another axis or none. Beyond two joints
-    also positions that count from the base, and beyond three joints all columns in reverse order. Where the map names
+    also positions that count from the base, and beyond three joints all columns in reverse order. With measured
     velocities, another unit of the positions is tried with and without that of the velocities.
     """
     n, straight, names = model.joints, np.eye(model.joints), described.urdf.joint_names
@@ -306,7 +312,7 @@ def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
             factor = ANGLE_RAD[unit] / ANGLE_RAD[described.units.q]
             found = _Motion(f"the positions are {UNITS[unit]}", f'`units.q` = "{unit}"', model, factor * straight)
             yield found
-            if described.columns.dq:
+            if has_velocities:
                 yield found._replace(is_of_velocities=False)
     for i in range(n):
         signs = np.where(np.arange(n) == i, -1.0, 1.0)

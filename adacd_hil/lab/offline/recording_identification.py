@@ -22,7 +22,7 @@ from adacd_hil.lab.offline.recording_import import ForeignRecording, RecordingSt
 from adacd_hil.lab.offline.recording_map import RecordingMap
 from adacd_hil.lab.offline.recording_verdict import Fitted, Verdict, judge_fit
 from adacd_hil.lab.serial_arm import offline
-from adacd_hil.lab.serial_arm.offline import ModelEstimate, OfflineCertificate, OfflineSettings
+from adacd_hil.lab.serial_arm.offline import ModelEstimate, OfflineSettings
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
 from adacd_hil.score.judge import contacts_of_alarms, explained_until
@@ -186,7 +186,7 @@ def identify(
     for record in records:
         estimate = offline.identify(model, record, estimate, settings)
     deviation = offline.parameter_deviation(model, records, before, estimate, settings)
-    certificate = _joined([offline.certify(model, part, estimate, settings) for part in tested.records], tested)
+    certificate = offline.certify(model, tested.records, estimate, settings)
     fit = Fitted(described, model, settings, before, estimate, deviation, certificate, tuple(recordings), tested)
     return Identified(
         **vars(fit),
@@ -214,26 +214,6 @@ def examined(described: RecordingMap, watched: Watched) -> Watched:
     if not faults and is_over.mean() > _MOST_OVER:
         faults.append(f"the torque is over a threshold for {is_over.mean():.0%} of the time: is it of this arm?")
     return replace(watched, faults=tuple(faults))
-
-
-def _joined(parts: list[OfflineCertificate], tested: ForeignRecording) -> OfflineCertificate:
-    """Return one certificate of all stretches of the tested recording from one certificate of each.
-
-    Thresholds are means, rms values are joined, both weighted by length; of residuals the largest, of margins the
-    smallest is taken.
-    """
-    weights = np.array([len(record.q) for record in tested.records], np.float64)
-    weights /= weights.sum()
-    rms, largest, lack, threshold, margins = (
-        np.array(values) for values in zip(*(vars(part).values() for part in parts), strict=True)
-    )
-    return OfflineCertificate(
-        residual_rms_Nm=np.sqrt(weights @ rms**2),
-        residual_max_Nm=largest.max(axis=0),
-        lack_Nm=np.sqrt(weights @ lack**2),
-        threshold_Nm=weights @ threshold,
-        margins=margins.min(axis=0),
-    )
 
 
 def watch(

@@ -98,7 +98,7 @@ class CsvSection:
     delimiter: str = setting(",", choices=(",", ";", "\t", " "), meaning="between two columns")
     decimal: str = setting(".", choices=(".", ","), meaning="sign before the decimals")
     has_header: bool = setting(True, meaning="whether the first row names the columns")
-    skip_rows: int = setting(0, low=0, high=10_000, meaning="rows before that")
+    skip_rows: int = setting(0, low=0, high=10_000, meaning="lines before that")
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ import numpy as np
 from adacd_hil.lab.offline.column_checks import (
     CLIPPED_REMEDY,
     CORRECT_UNITS,
+    LEFT_OUT_REMEDY,
     RecordingFinding,
     clipped_torque,
     find_faults,
@@ -116,6 +117,11 @@ class Fitted:
         """Length of the fitted recordings, s."""
         return sum(recording.duration_s for recording in self.fitted)
 
+    @property
+    def has_velocities(self) -> bool:
+        """Whether the velocities of all recordings were measured, not derived from the positions."""
+        return all(recording.has_velocities for recording in (*self.fitted, self.tested))
+
 
 def judge_fit(fit: Fitted) -> Verdict:
     """Return the verdict on a fit: whether the model explains the torque of the test, reasons if not, next step.
@@ -161,7 +167,7 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Recor
         return [*scale, *remarks]
     if not all(_is_noise(fit, joints)) and (readings := list(_of_readings(fit, joints, WHOLE if columns else 0.0))):
         return [*readings, *remarks]
-    if is_good and not (columns and min(joint.share for joint in joints) < WHOLE):
+    if is_good and not (columns and _least_share(joints) < WHOLE):
         return [*scale, *remarks]
     lack = list(_of_lack(fit, joints))
     causes = wrong or list(columns)
@@ -178,9 +184,8 @@ def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
 
 def _shares(fit: Fitted) -> tuple[JointShare, ...]:
     """Return each joint's result of the test, in their order: explained share, margin, rms torque, explained or not."""
-    parts = [offline.filtered(fit.model, record, fit.estimate, fit.settings) for record in fit.tested.records]
-    torque, residual = (np.concatenate([getattr(part, name) for part in parts]) for name in ("tau_f", "tau_ext_hat"))
-    unit = np.concatenate([part.unit for part in parts])
+    trace = offline.filtered(fit.model, fit.tested.records, fit.estimate, fit.settings)
+    torque, residual, unit = trace.tau_f, trace.tau_ext_hat, trace.unit
     spread = torque - np.outer(unit, unit @ torque / (unit @ unit))
     squares, left = np.sum(spread**2, axis=0), np.sum(residual**2, axis=0)
     is_there = squares > 1e-18 * np.maximum(np.sum(torque**2, axis=0), 1e-12)
@@ -210,13 +215,18 @@ def percent(share: float) -> str:
     return f"{100.0 * max(share, 0.0):.{digits}f} %" if share < 0.99995 else "100.0 %"
 
 
+def _least_share(joints: Sequence[JointShare]) -> float:
+    """Return the smallest share of the joints with torque; nan if none has."""
+    return min((joint.share for joint in joints if not math.isnan(joint.share)), default=math.nan)
+
+
 def _headline(fit: Fitted, joints: Sequence[JointShare], is_explained: bool) -> str:
-    shares = [joint.share for joint in joints if not math.isnan(joint.share)]
-    least = f"{percent(min(shares))} of the torque" if shares else "no torque"
+    share = _least_share(joints)
+    if math.isnan(share):
+        return "NOT explained: no torque"
+    least = f"{percent(share)} of the torque"
     where = " at the worst joint" if len(joints) > 1 else ""
     margin = f"margin {fit.certificate.margin:.2f}" if math.isfinite(fit.certificate.margin) else "no margin"
-    if not shares:
-        return f"NOT explained: {least}"
     if is_explained:
         return f"explained; {margin}" if fit.certificate.margin >= 1.0 else f"explained: {least}{where}; {margin}"
     if all(joint.is_explained for joint in joints):
@@ -241,11 +251,11 @@ def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Ite
     the likeliest explains less than the share `least` of a joint's torque.
     """
     fitted = [record for recording in fit.fitted for record in recording.records]
-    readings = find_readings(fit.described, fit.model, fit.settings, fitted, fit.tested.records)
+    readings = find_readings(fit.described, fit.model, fit.settings, fitted, fit.tested.records, fit.has_velocities)
     if not readings or 1.0 - readings[0].unexplained < least:
         return
     text = ", or ".join(reading.text for reading in readings[:3])
-    by_map, where = percent(min(joint.share for joint in joints)), " at the worst joint" if len(joints) > 1 else ""
+    by_map, where = percent(_least_share(joints)), " at the worst joint" if len(joints) > 1 else ""
     yield RecordingFinding(
         f"{text}: so {percent(1.0 - readings[0].unexplained)} of the torque is explained{where}, {by_map} as the map "
         "has it",
@@ -342,13 +352,14 @@ def _predicted_share(fitted: Vector, tested: Vector) -> float:
 def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
     """Report a unit of torques or angles by which the torques differ from the URDF's masses, or an impossible inertia.
 
-    The ratio to the masses is judged if it is over `_SIGMAS` deviations and every joint's share over `_MOSTLY`; an
-    angle needs shares of `WHOLE`. A ratio that isn't reported as a unit is a remark if it is over `_ODD_SCALE` or below
-    its reciprocal. The inertia about joint 1 is judged if no unit was reported and every share is at least `HALF`.
+    Joints without torque don't count. The ratio to the masses is judged if it is over `_SIGMAS` deviations and every
+    joint's share over `_MOSTLY`; an angle needs shares of `WHOLE`. A ratio that isn't reported as a unit is a remark if
+    it is over `_ODD_SCALE` or below its reciprocal. The inertia about joint 1 is judged if no unit was reported and
+    every share is at least `HALF`.
     """
     scale, sigma = _scale_of_urdf(fit)
     mass_kg = _mass_at_reach(fit)
-    units, least = fit.described.units, min(joint.share for joint in joints)
+    units, least = fit.described.units, _least_share(joints)
     if scale is not None and abs(scale) > _SIGMAS * sigma and least > _MOSTLY:
         text = f"the torques are {scale:.3g} times those that the masses of the URDF need"
         meant = _milli(abs(scale), mass_kg, units.tau_J)
@@ -437,30 +448,16 @@ def _of_inertia(fit: Fitted) -> Iterator[RecordingFinding]:
 
 
 def _of_friction(fit: Fitted) -> Iterator[RecordingFinding]:
-    """Report, as remarks, friction that drives a joint on, or whose viscous or Coulomb term is negative.
-
-    It must be so by more than `_SIGMAS` deviations.
-    """
-    speed = np.abs(samples((fit.tested,), "dq"))
+    """Report, as remarks, joints whose viscous or Coulomb friction is negative by more than `_SIGMAS` deviations."""
     theta, deviation = fit.estimate.theta, fit.deviation
-    mean, square = speed.mean(axis=0), (speed**2).mean(axis=0)
     for joint, name in enumerate(fit.described.urdf.joint_names):
         F_v, F_c = (fit.model.place_of(kind).start + joint for kind in ("F_v", "F_c"))
-        power = theta[F_c] * mean[joint] + theta[F_v] * square[joint]
-        sigma = math.hypot(deviation[F_c] * mean[joint], deviation[F_v] * square[joint])
-        if power < -_SIGMAS * sigma:
+        if any(theta[place] < -_SIGMAS * deviation[place] for place in (F_v, F_c)):
             yield RecordingFinding(
-                f"friction drives {name} on: F_v {theta[F_v]:.3g} ± {deviation[F_v]:.1g} Nm s/rad, F_c "
-                f"{theta[F_c]:.3g} ± {deviation[F_c]:.1g} Nm",
+                f"friction of {name} is negative: F_v {theta[F_v]:.3g} ± {deviation[F_v]:.1g} Nm s/rad, F_c "
+                f"{theta[F_c]:.3g} ± {deviation[F_c]:.1g} Nm; it drives the joint, or its curve is no straight line",
                 is_against=False,
             )
-        for place, unit in ((F_v, "Nm s/rad"), (F_c, "Nm")):
-            if power >= -_SIGMAS * sigma and theta[place] < -_SIGMAS * deviation[place]:
-                yield RecordingFinding(
-                    f"{fit.model.parameter_names[place]} of {name} is negative, {theta[place]:.3g} ± "
-                    f"{deviation[place]:.1g} {unit}: the friction's curve is not a straight line",
-                    is_against=False,
-                )
 
 
 def _of_excitation(fit: Fitted) -> Iterator[RecordingFinding]:
@@ -535,8 +532,8 @@ def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[Recordin
     if loud:
         each = ", ".join(f"{joints[i].name} {contact_Nm[i]:.2g} Nm" for i in loud)
         noise = fit.settings.velocity_noise_rad_s
-        source = f" of the velocities, {noise:.2g} rad/s," if noise and fit.described.columns.dq else ""
-        remedy = "; without `columns.dq` they are derived from the positions" if source else ""
+        source = f" of the velocities, {noise:.2g} rad/s," if noise and fit.has_velocities else ""
+        remedy = f"; {LEFT_OUT_REMEDY}" if source else ""
         yield RecordingFinding(
             f"noise{source} hides contacts smaller than the torque itself: they show from about {each} on{remedy}",
             is_against=False,

@@ -7,7 +7,7 @@ velocities or torques by one of its words. Without heads, columns whose slope ot
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -17,12 +17,14 @@ import numpy as np
 
 from adacd_hil.lab.offline.csv_recording import (
     DELIMITERS,
+    head_of,
     is_iso_time,
     is_number,
     iso_seconds,
     opened_text,
     read_number,
     split_rows,
+    trimmed,
 )
 from adacd_hil.lab.offline.recording_map import CsvSection, unit_of
 from adacd_hil.log.log_files import LogError
@@ -101,17 +103,14 @@ def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
     with opened_text(path) as file:
         lines = list(islice(file, _SEEN_ROWS + _HEAD_ROWS))
     form, heads, units, first = _form(path, lines)
-    values, is_iso = _values(_split(path, lines, form.delimiter)[first:], len(heads), form.decimal)
+    rows = islice(split_rows(path, lines, form.delimiter), first, None)
+    values, is_iso = _values(rows, len(heads), form.decimal)
     guess = TableGuess(form, heads, units, values, is_iso)
     if form.has_header:
         _by_heads(guess, joint_names)
     else:
         _by_values(guess, len(joint_names))
     return guess
-
-
-def _split(path: Path, lines: list[str], delimiter: str) -> list[list[str]]:
-    return [[cell.strip() for cell in cells] for cells in split_rows(path, lines, delimiter)]
 
 
 def _is_full(cells: list[str], decimal: str) -> bool:
@@ -136,19 +135,14 @@ def _form(path: Path, lines: list[str]) -> _Form:
     best: _Form | None = None
     for delimiter in DELIMITERS:
         for decimal in (".", ",") if delimiter != "," else (".",):
-            rows = [_trimmed(cells) for cells in _split(path, lines[:_HEAD_ROWS], delimiter)]
+            table = list(split_rows(path, lines[:_HEAD_ROWS], delimiter))
+            rows = [trimmed(cells) for _, cells in table]
             first = next((k for k in range(len(rows)) if _begins(rows[k : k + _FULL_ROWS], decimal)), None)
             if first is not None and (best is None or len(rows[first]) > len(best[1])):
-                best = _form_at(rows, first, delimiter, decimal)
+                best = _form_at(rows, [0, *(number for number, _ in table)], first, delimiter, decimal)
     if best is None:
         raise LogError(f"recording {path}: no rows of numbers in its first {_HEAD_ROWS} lines")
     return best
-
-
-def _trimmed(cells: list[str]) -> list[str]:
-    while len(cells) > 1 and not cells[-1]:
-        cells = cells[:-1]
-    return cells
 
 
 def _begins(rows: list[list[str]], decimal: str) -> bool:
@@ -157,25 +151,23 @@ def _begins(rows: list[list[str]], decimal: str) -> bool:
     return len(rows) == _FULL_ROWS and count >= 3 and all(len(row) == count and _is_full(row, decimal) for row in rows)
 
 
-def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) -> _Form:
-    """Return the form of a file whose data begin at row `first`, from 0.
+def _form_at(rows: list[list[str]], skipped: list[int], first: int, delimiter: str, decimal: str) -> _Form:
+    """Return the form of a file whose data begin at row `first`, from 0. skipped: number of lines above each row.
 
     The head is the closest row above with as many cells, the first of them not empty; a row of units may lie between.
     Without such a row, the heads are "1", "2", ….
     """
     count = len(rows[first])
-    above = [k for k in range(first) if len(rows[k]) == count and rows[k][0].removeprefix("#").strip()]
+    above = [k for k in range(first) if len(rows[k]) == count and head_of(rows[k])[0]]
     units: tuple[str, ...] = ("",) * count
     if len(above) > 1 and any(map(unit_of, rows[above[-1]])):
         units = tuple(map(unit_of, rows[above.pop()]))
-    if not above:
-        return CsvSection(delimiter, decimal, False, first), tuple(str(k + 1) for k in range(count)), units, first
-    heads = [cell.strip() for cell in rows[above[-1]]]
-    heads[0] = heads[0].removeprefix("#").strip()
-    return CsvSection(delimiter, decimal, True, above[-1]), tuple(heads), units, first
+    head = above[-1] if above else first
+    heads = head_of(rows[head]) if above else [str(k + 1) for k in range(count)]
+    return CsvSection(delimiter, decimal, bool(above), skipped[head]), tuple(heads), units, first
 
 
-def _values(rows: list[list[str]], count: int, decimal: str) -> tuple[Vector, bool]:
+def _values(rows: Iterable[tuple[int, list[str]]], count: int, decimal: str) -> tuple[Vector, bool]:
     """Return the cells as numbers (k, count), dates in s, nan for other cells, and whether the first column has dates.
 
     It has if the first cell of the first row with all cells is no number. Rows with fewer than `count` cells are left
@@ -183,10 +175,10 @@ def _values(rows: list[list[str]], count: int, decimal: str) -> tuple[Vector, bo
     """
     table: list[list[float]] = []
     is_iso = False
-    for cells in rows[:_SEEN_ROWS]:
+    for _, cells in islice(rows, _SEEN_ROWS):
         if len(cells) >= count:
             is_iso |= not table and not is_number(cells[0], decimal)
-            table.append([_number(cell, decimal) for cell in cells[:count]])
+            table.append([_number(cell.strip(), decimal) for cell in cells[:count]])
     return np.array(table).reshape(-1, count), is_iso
 
 
@@ -267,12 +259,16 @@ def _taken_apart(place: int, text: str, joint_names: Sequence[str]) -> _Head:
 def _role(words: tuple[str, ...], unit: str) -> str:
     """Return "time", "q", "dq", "tau_J", "current" or "contact", by a head's words, else by its unit.
 
-    "" if neither tells the role, or a word is of another quantity, such as an acceleration.
+    A word of time doesn't count beside a unit of another role: T is a torque, too. "" if neither tells the role, or a
+    word is of another quantity, such as an acceleration.
     """
     if any(word in _OTHERS for word in words):
         return ""
-    found = (role for role, known in _ROLES.items() if any(word in known for word in words))
-    return next(found, "") or _UNIT_ROLES.get(unit, "")
+    by_unit = _UNIT_ROLES.get(unit, "")
+    found = [role for role, known in _ROLES.items() if any(word in known for word in words)]
+    if by_unit not in ("", "time") and "time" in found:
+        found.remove("time")
+    return found[0] if found else by_unit
 
 
 # By values.
@@ -285,12 +281,10 @@ def _by_values(guess: TableGuess, n: int) -> None:
     are the positions, the later ones the velocities, and the n after them, if there are so many, the torques. Otherwise
     the first n columns after the time are the positions, the next n the torques; with too few columns neither is set.
     """
-    values, heads = guess.values, guess.heads
-    grows = [place for place in range(values.shape[1]) if np.all(np.diff(values[:, place]) > 0.0)]
-    first = 0
-    if grows and grows[0] == 0:
-        guess.columns["time"], guess.reasons["time"] = (heads[0],), "it grows from row to row"
-        first = 1
+    values = guess.values
+    first = int(np.all(np.diff(values[:, 0]) > 0.0))
+    if first:
+        guess.columns["time"], guess.reasons["time"] = (guess.heads[0],), "it grows from row to row"
     blocks = [tuple(range(begin, begin + n)) for begin in range(first, values.shape[1] - n + 1)]
     time = values[:, 0] if first else np.arange(len(values), dtype=np.float64)
     for q in blocks:

@@ -194,7 +194,7 @@ class OfflineCertificate:
 
 
 class FilteredRecord(NamedTuple):
-    """A record behind a filter, (k, n), Nm; unit (k,): the filter's output for a constant 1 Nm."""
+    """Records behind a filter, (k, n), Nm; unit (k,): the filter's output for a constant 1 Nm."""
 
     tau_ext_hat: Vector  # predicted minus measured torque
     deviation: Vector  # of tau_ext_hat, by noise and P
@@ -273,12 +273,15 @@ def parameter_deviation(
     return np.asarray(np.sqrt(np.max([np.diag(kind) for kind in kinds], axis=0)))
 
 
-def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> FilteredRecord:
-    """Return a record behind the smoothed filter of the fit, its external torque and deviation by the frozen estimate.
+def filtered(
+    model: ArmModel, records: Sequence[Record], estimate: ModelEstimate, settings: OfflineSettings
+) -> FilteredRecord:
+    """Return records behind the smoothed filter of the fit, with external torque and deviation by the frozen estimate.
 
-    Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
+    The samples are those of all records, at least one, in turn; the filter begins anew with each. Raises ValueError if
+    a record or `noise_Nm` and model differ in their number of joints.
     """
-    return _trace(model, record, estimate, settings, estimate.theta)
+    return _traces(model, records, estimate, settings, estimate.theta)
 
 
 def fit_rows(model: ArmModel, record: Record, settings: OfflineSettings) -> tuple[Vector, Vector]:
@@ -310,13 +313,16 @@ def filtered_noise_Nm(settings: OfflineSettings) -> Vector:
     return gain * np.array(settings.noise_Nm)
 
 
-def certify(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> OfflineCertificate:
-    """Test an estimate on a record of free motion that `identify` has not seen; return residuals and margins.
+def certify(
+    model: ArmModel, records: Sequence[Record], estimate: ModelEstimate, settings: OfflineSettings
+) -> OfflineCertificate:
+    """Test an estimate on records of free motion that `identify` has not seen; return residuals and margins.
 
-    A joint's margin is the smallest ratio of threshold to residual; below 1 there was a false alarm. The caller judges
-    it. Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
+    records: at least one; the filter begins anew with each. A joint's margin is the smallest ratio of threshold to
+    residual; below 1 there was a false alarm. The caller judges it. Raises ValueError if a record or `noise_Nm` and
+    model differ in their number of joints.
     """
-    trace = _trace(model, record, estimate, settings)
+    trace = _traces(model, records, estimate, settings)
     residual = np.abs(trace.tau_ext_hat)
     mean_square = np.mean(residual**2, axis=0)
     lack = np.sqrt(np.maximum(mean_square - np.mean(trace.deviation**2, axis=0), 0.0))
@@ -404,6 +410,18 @@ def _noise_gains(cutoff_rad_s: float, settings: OfflineSettings, is_smoothed: bo
             R += 2.0 * later / variance
         gains.append(math.sqrt(variance))
     return gains[0], gains[1], R
+
+
+def _traces(
+    model: ArmModel,
+    records: Sequence[Record],
+    estimate: ModelEstimate,
+    settings: OfflineSettings,
+    theta_M: Vector | None = None,
+) -> FilteredRecord:
+    """Return the samples of `_trace` of all records, at least one, in turn. Arguments and errors: as of `_trace`."""
+    parts = [_trace(model, record, estimate, settings, theta_M) for record in records]
+    return FilteredRecord(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _trace(

@@ -325,16 +325,10 @@ def _read_origin(element: Element, where: str) -> FramePose:
     origin = _only(element, "origin", where)
     if origin is None:
         return FramePose(np.eye(3), np.zeros(3))
-    xyz, (roll, pitch, yaw) = _numbers(origin, "xyz", where, 0.0), _numbers(origin, "rpy", where, 0.0)
-    cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
-    rotation = np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
-    return FramePose(rotation, xyz)
+    from scipy.spatial.transform import Rotation  # takes 0.2 s to load
+
+    xyz, rpy = _numbers(origin, "xyz", where, 0.0), _numbers(origin, "rpy", where, 0.0)
+    return FramePose(Rotation.from_euler("xyz", rpy).as_matrix(), xyz)
 
 
 def _named(robot: Element, tag: str) -> dict[str, Element]:

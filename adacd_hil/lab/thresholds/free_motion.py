@@ -48,9 +48,7 @@ from adacd_hil.settings.setting_keys import changed_keys
 APART_S: Final = 0.6
 """Distance from contacts and gaps: six time constants of the slowest filter."""
 MOST_SAMPLES: Final = 1_000_000
-"""Most samples that are processed together; of more motion, windows are taken."""
-WINDOW: Final = 10_000
-"""Samples of such a window."""
+"""Most samples that are processed together, and a piece of a log; of more motion, some pieces are taken."""
 TOPICS: Final = (SCHEME.name,)
 _PERIODS: Final = 1_000_000
 """Number of intervals whose median is the period."""
@@ -359,57 +357,35 @@ def check_together(logs: Sequence[LoggedMotion]) -> None:
 
 
 def sample_of(logs: Sequence[LoggedMotion]) -> Motion:
-    """Return all motion of the logs, one after the other; of more than MOST_SAMPLES samples only windows.
+    """Return all motion of the logs, one after the other; of more than `MOST_SAMPLES` samples only some pieces.
 
-    The windows have free motion and are spread evenly. The first sample of each log, and of each window without the
-    window before, counts as after a gap and as not free. Raises LogError if a log can't be read, or as
+    They have free motion and are spread evenly over all such pieces. The first sample of each log, and of each piece
+    without the piece before, counts as after a gap and as not free. Raises LogError if a log can't be read, or as
     `check_together`.
     """
     check_together(logs)
-    chosen = _windows(logs)
+    total = sum(len(log.is_free) for log in logs)
+    seen = taken = 0  # samples of pieces with free motion, and those taken of them
     parts: list[Motion] = []
-    for log, is_chosen in zip(logs, chosen, strict=True):
-        place = 0
-        was_chosen = False
+    for log in logs:
+        was_taken = False
         for motion in log.pieces():
-            rows = is_chosen[place : place + len(motion.q)]
-            place += len(motion.q)
-            if rows.any():
-                parts.append(_part(motion, rows, was_chosen))
-            was_chosen = bool(rows[-1])
+            count = len(motion.q) if motion.is_free.any() else 0
+            is_taken = total <= MOST_SAMPLES or (count > 0 and taken * total <= seen * MOST_SAMPLES)
+            if is_taken:
+                parts.append(motion if was_taken else _begun_anew(motion))
+                taken += count
+            seen += count
+            was_taken = is_taken
     columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in (*_COLUMNS, "is_free")}
     return Motion(**columns, period_s=logs[0].period_s)
 
 
-def _windows(logs: Sequence[LoggedMotion]) -> list[Mask]:
-    """Return the mask (N,) of each log's samples to process: all, or only windows with free motion, spread evenly.
-
-    All if they are at most `MOST_SAMPLES`; a window has `WINDOW` samples.
-    """
-    if sum(len(log.is_free) for log in logs) <= MOST_SAMPLES:
-        return [np.ones(len(log.is_free), np.bool_) for log in logs]
-    has_free = [np.logical_or.reduceat(log.is_free, np.arange(0, len(log.is_free), WINDOW)) for log in logs]
-    candidates = np.flatnonzero(np.concatenate(has_free))
-    places = np.linspace(0, len(candidates) - 1, min(MOST_SAMPLES // WINDOW, len(candidates))).astype(np.int64)
-    is_chosen = np.zeros(sum(map(len, has_free)), np.bool_)
-    is_chosen[candidates[places]] = True
-    ends = np.cumsum([len(windows) for windows in has_free])[:-1]
-    return [
-        np.repeat(windows, WINDOW)[: len(log.is_free)]
-        for log, windows in zip(logs, np.split(is_chosen, ends), strict=True)
-    ]
-
-
-def _part(motion: Motion, rows: Mask, was_chosen: bool) -> Motion:
-    """Return the samples of `rows`; the first of each run of them is marked as after a gap and as not free.
-
-    was_chosen: whether the sample before the motion was taken, so that a run may go on.
-    """
-    if rows.all() and was_chosen:
-        return motion
-    is_first = rows & ~np.concatenate(([was_chosen], rows[:-1]))
-    part = replace(motion, interval_s=np.where(is_first, 0.0, motion.interval_s), is_free=motion.is_free & ~is_first)
-    return replace(part, **{name: getattr(part, name)[rows] for name in (*_COLUMNS, "is_free")})
+def _begun_anew(motion: Motion) -> Motion:
+    """Return a copy of a motion whose first sample counts as after a gap and as not free."""
+    interval_s, is_free = motion.interval_s.copy(), motion.is_free.copy()
+    interval_s[0], is_free[0] = 0.0, False
+    return replace(motion, interval_s=interval_s, is_free=is_free)
 
 
 def torque_streams(pieces: Iterable[Motion], lag_s: float) -> Iterator[tuple[Motion, tuple[Vector, Vector]]]:

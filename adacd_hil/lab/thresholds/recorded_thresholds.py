@@ -2,7 +2,7 @@
 
 `free_motion` defines the motion that counts. The detectors run over all of this motion, and thresholds come from all of
 their statistics. The velocity's lag (by regression of the stream on the filtered slope of the torque), the stream's
-covariance and the causes of a threshold come from the same motion, of more than `MOST_SAMPLES` from windows of it.
+covariance and the causes of a threshold come from the same motion, of more than `MOST_SAMPLES` from pieces of it.
 """
 
 from collections.abc import Sequence
@@ -127,27 +127,26 @@ def run_detectors(logs: Sequence[LoggedMotion], progress: Progress = lambda _: N
 def _peaks(logs: Sequence[LoggedMotion], bank: DetectorBank, lag_s: float, progress: Progress) -> Vector:
     """Return the largest statistic per block of `BLOCK_S`, channel and joint (B, channels, n) over all logs in turn.
 
-    NaN in blocks that are not wholly free of contact. A block may begin in one log and end in the next.
+    NaN in blocks that are not wholly free of contact. Blocks begin anew with each log, so its last may be shorter.
     """
-    block = round(BLOCK_S / logs[0].period_s)
-    free = np.concatenate([log.is_free for log in logs])
-    peaks = np.zeros((-(-len(free) // block), len(channels()), JOINTS))
-    rest = np.empty((0, JOINTS)), np.empty((0, JOINTS))  # less than a block
-    place = 0
-    milestones = Milestones(lambda count: progress(f"{log.path}: running the detectors, {count} of {len(free)} cycles"))
+    peaks: list[Vector] = []
+    count, total = 0, sum(len(log.is_free) for log in logs)
+    milestones = Milestones(lambda at: progress(f"{log.path}: running the detectors, {at} of {total} cycles"))
     for log in logs:
+        block = round(BLOCK_S / log.period_s)
+        of_log: list[Vector] = []
+        rest = np.empty((0, JOINTS)), np.empty((0, JOINTS))  # less than a block
         for motion, new in torque_streams(log.pieces(), lag_s):
             for column in new:
                 column[~motion.is_free] = 0.0
             z, held_Nm = (np.concatenate(pair) for pair in zip(rest, new, strict=True))
-            end = place + len(z) // block
-            whole = (end - place) * block
-            peaks[place:end] = bank.take_stream(z[:whole], held_Nm[:whole], block)
-            rest, place = (z[whole:], held_Nm[whole:]), end
-            milestones.reach(place * block)
-    peaks[place:] = bank.take_stream(*rest, block)
-    peaks[~np.logical_and.reduceat(free, np.arange(0, len(free), block))] = np.nan
-    return peaks
+            whole = len(z) // block * block
+            of_log.append(bank.take_stream(z[:whole], held_Nm[:whole], block))
+            rest, count = (z[whole:], held_Nm[whole:]), count + whole
+            milestones.reach(count)
+        peaks.append(np.concatenate([*of_log, bank.take_stream(*rest, block)]))
+        peaks[-1][~np.logical_and.reduceat(log.is_free, np.arange(0, len(log.is_free), block))] = np.nan
+    return np.concatenate(peaks)
 
 
 @dataclass(frozen=True)

@@ -250,7 +250,7 @@ def observe_detectors(logs: Sequence[TunedLog], progress: Progress) -> list[Obse
     """
     places_of = detectors()
     statistics = run_detectors([log.motion for log in logs], progress)
-    is_chosen_on = chosen_blocks(logs)
+    is_chosen_on = np.concatenate([log.is_chosen_on for log in logs])
     trials: dict[str, list[Trial]] = {name: [] for name in places_of}
     for log in logs:
         for trial in _trials(log, statistics):
@@ -261,12 +261,6 @@ def observe_detectors(logs: Sequence[TunedLog], progress: Progress) -> list[Obse
         Observed(name, statistics.peaks[:, places], is_chosen_on, tuple(trials[name]) if has_truth else None)
         for name, places in places_of.items()
     ]
-
-
-def chosen_blocks(logs: Sequence[TunedLog]) -> NDArray[np.bool_]:
-    """Return, per block of the logs' joined motion (B,), whether its first cycle is in the half to choose on."""
-    chosen = [np.repeat(log.is_chosen_on, log.block)[: len(log.motion.is_free)] for log in logs]
-    return np.concatenate(chosen)[:: logs[0].block]
 
 
 def _trials(log: TunedLog, statistics: Statistics) -> Iterator[Trial]:

@@ -34,7 +34,6 @@ MOST_RATIO = 200
 """Largest ratio of all decompressed bytes of a file to their size in the file."""
 FREE_BYTES = 64 << 20
 """Bytes that may be decompressed from a file of any size."""
-_PIECE_BYTES = 1 << 20
 _KINDS = ("", "zstd", "lz4")
 
 
@@ -104,36 +103,20 @@ def _decompress(compression: str, data: bytes, most_bytes: int) -> bytes:
     """Return decompressed data, of zstd and lz4 at most one byte more than `most_bytes`.
 
     Raises ChunkError for lz4 data that are cut, or zstd data that state more bytes, and the errors of the two
-    libraries.
+    libraries, among them ZstdError for zstd data that state no size and have more.
     """
     if compression == "":
         return data
     if compression == "zstd":
-        return _unzstd(data, most_bytes)
+        if zstandard.frame_content_size(data) > most_bytes:
+            raise ChunkError(f"opens to more than {most_bytes} bytes")
+        decompressor = zstandard.ZstdDecompressor(max_window_size=MOST_BYTES)
+        return decompressor.decompress(data, max_output_size=most_bytes + 1)
     stream = lz4.frame.LZ4FrameDecompressor()
     opened: bytes = stream.decompress(data, most_bytes + 1)
     if not stream.eof and len(opened) <= most_bytes:
         raise ChunkError("can't be decompressed: it is cut")
     return opened
-
-
-def _unzstd(data: bytes, most_bytes: int) -> bytes:
-    """Return zstd data decompressed, at most `most_bytes` + 1 if their size isn't stated.
-
-    Raises ChunkError if they state a larger one.
-    """
-    size = zstandard.frame_content_size(data)
-    decompressor = zstandard.ZstdDecompressor(max_window_size=MOST_BYTES)
-    if size > most_bytes:
-        raise ChunkError(f"claims {size} bytes, more than {most_bytes}")
-    if size >= 0:
-        return decompressor.decompress(data, max_output_size=max(size, 1))
-    pieces, left = [], most_bytes + 1
-    with decompressor.stream_reader(data) as reader:  # a writer that didn't know
-        while left > 0 and (piece := reader.read(min(left, _PIECE_BYTES))):
-            pieces.append(piece)
-            left -= len(piece)
-    return b"".join(pieces)
 
 
 _START = struct.Struct("<BQ")

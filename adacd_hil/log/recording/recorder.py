@@ -21,7 +21,7 @@ from adacd_hil.log.log_parts import parts_of
 from adacd_hil.log.recording import packet, processes
 from adacd_hil.log.recording.processes import LiveService, WriterSetup, start_module
 from adacd_hil.log.recording.ring import Ring, padded_bytes
-from adacd_hil.log.recording.run_folder import check_free, make_room
+from adacd_hil.log.recording.run_folder import make_room
 from adacd_hil.log.types.topics import LogChannel, run_channels
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.settings.run_settings import LogSettings
@@ -83,7 +83,7 @@ class Recorder:
     ) -> None:
         """Create the file, which must not exist (see run_folder.py), and start the writer.
 
-        The log of a run whose start failed is moved aside first. messages: of the DBC, whose frames are decoded. The
+        The log of a start that failed is moved aside first. messages: of the DBC, whose frames are decoded. The
         counts: see `run_channels`; by default those of the paper's scheme. attachments, metadata: at the file's
         beginning. epoch_ns: added to t_ns for the log's times; 0 in lockstep. blocking: lockstep. channels: of a log
         that is no run's. settings: sizes of parts and buffer. live: live view to open. Raises LogExistsError if a log
@@ -103,12 +103,12 @@ class Recorder:
         self._summary: LogSummary | None = None
         self._is_blocking = blocking
         self._unannounced = 0  # bytes in the ring since the writer was last woken
-        is_run, told = channels is None, plain_tables(messages)
+        told = plain_tables(messages)
         try:
             channels = channels or run_channels(parameter_count, told, further_count, channel_count)
         except LogError as error:
             raise LogError(f"log {path} can't be written: {error}") from None
-        file = _create(path, is_run)
+        file = _create(path)
         setup = WriterSetup(
             path=path.absolute(),
             is_blocking=blocking,
@@ -271,18 +271,15 @@ class Recorder:
         self.close()
 
 
-def _create(path: Path, is_run: bool) -> int:
-    """Create the first part of a log; return its file descriptor. is_run: move the log of a failed start aside first.
+def _create(path: Path) -> int:
+    """Create the first part of a log, the log of a failed start moved aside; return its file descriptor.
 
     Raises LogExistsError if a log is there already, LogError if the file can't be created.
     """
-    if is_run:
-        make_room(path)
-    else:
-        check_free(path)
+    make_room(path)
     try:
         return create_file(path)
-    except FileExistsError:  # created since `check_free`
+    except FileExistsError:  # created since `make_room`
         raise LogExistsError(f"{path} is being written by another run; choose another folder with --out") from None
     except OSError as error:
         raise LogError(f"log {path} can't be created: {error.strerror}") from None

@@ -94,13 +94,14 @@ def _is_failed_start(path: Path) -> bool:
 
 
 def _has_no_cycle(file: IO[bytes]) -> bool:
-    """Return whether a run's log has ended properly without a cycle, or has no message at all.
+    """Return whether a log of ours, a run's or an emulator's, has ended properly without a cycle, or has no message.
 
-    False for a file without a summary, or one that is no run's. Raises LogError for an invalid record.
+    False for a file without a summary, or one that isn't ours. Raises LogError for an invalid record.
     """
     # Only needed for an existing log, and slow to import.
     from adacd_hil.log.mcap.mcap_records import parse, read_end, read_record
     from adacd_hil.log.types.topics import CYCLE
+    from adacd_hil.log.types.truth_topic import TRUTH
 
     end = read_end(file)
     kinds: dict[int, list[Any]] = {Opcode.STATISTICS: [], Opcode.CHANNEL: [], Opcode.METADATA_INDEX: []}
@@ -112,6 +113,7 @@ def _has_no_cycle(file: IO[bytes]) -> bool:
     found = (read_record(file, index.offset).body for index in kinds[Opcode.METADATA_INDEX])
     metadata = {each.name: each.metadata for each in (parse(Opcode.METADATA, body) for body in found)}
     counts = kinds[Opcode.STATISTICS][0].channel_message_counts
-    cycles = sum(counts.get(channel.id, 0) for channel in kinds[Opcode.CHANNEL] if channel.topic == CYCLE.name)
+    of_cycles = (channel for channel in kinds[Opcode.CHANNEL] if channel.topic in (CYCLE.name, TRUTH.name))
+    cycles = sum(counts.get(channel.id, 0) for channel in of_cycles)
     is_closed = metadata.get(SUMMARY_METADATA, {}).get(ENDING_KEY) == CLOSED
     return bool(metadata.get(RUN_METADATA)) and ((is_closed and not cycles) or not sum(counts.values()))

@@ -48,7 +48,6 @@ from adacd_hil.records import (
     ContactKind,
     ContactLevel,
     ContactReport,
-    CycleRecord,
     FaultReason,
     FrameChecks,
     Layout,
@@ -345,19 +344,6 @@ def pack_arm(arm: ArmState, first_cycle: int) -> bytes:
 def pack_contact(report: ContactReport) -> bytes:
     """Return a /contact message as bytes, without the stamp."""
     return CONTACT.pack(*(getattr(report, member.name) for member in CONTACT.head))
-
-
-def pack_control(cycle: int, block: Vector, gate_flags: int, enable: bool, quick_stop: bool) -> bytes:
-    """Return a /control message as bytes, without the stamp; `block` is laid out by CONTROL_LAYOUT.
-
-    gate_flags: a bit for each limit that acted. enable, quick_stop: requests to the drives.
-    """
-    return CONTROL.pack(cycle, gate_flags, enable, quick_stop, block=block)
-
-
-def pack_cycle(record: CycleRecord) -> bytes:
-    """Return a /cycle message as bytes, without the stamp."""
-    return CYCLE.pack(*record)
 
 
 def pack_frame_checks(checks: FrameChecks) -> bytes:

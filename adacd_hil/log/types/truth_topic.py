@@ -1,7 +1,7 @@
 """The topic of the emulator's own log, and the quantities in it: what the emulator knows and the host must not use."""
 
 from adacd_hil.log.types.topics import CYCLE_NUMBER, EVENTS, ChannelId, LogChannel, OwnTopic
-from adacd_hil.records import JOINTS, PARAMETER_NAMES, Field, Layout, Vector
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, Field, Layout
 
 TRUTH_LAYOUT = Layout(
     (
@@ -33,8 +33,3 @@ TRUTH = OwnTopic(ChannelId.TRUTH, "/truth", "Truth", head=(CYCLE_NUMBER,), block
 def truth_channels() -> tuple[LogChannel, ...]:
     """Return the topics of the emulator's own log as channels of a file."""
     return TRUTH.channel(), EVENTS.channel()
-
-
-def pack_truth(cycle: int, block: Vector) -> bytes:
-    """Return a /truth message as bytes, without the stamp; `block` is laid out by TRUTH_LAYOUT."""
-    return TRUTH.pack(cycle, block=block)
