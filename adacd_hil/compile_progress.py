@@ -7,6 +7,8 @@ don't import numba, which takes long, too.
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from adacd_hil.printable import number_of
+
 Listener = Callable[[str], None]
 """Called with the line to show.
 
@@ -32,4 +34,4 @@ def listening(listener: Listener) -> Iterator[None]:
 def call_listeners(count: int) -> None:
     """Call the listeners with a line that says how many functions this process has compiled so far."""
     for listener in _listeners:
-        listener(f"compiling, {count} functions so far, once per version")
+        listener(f"compiling, {number_of(count, 'function')} so far, once per version")

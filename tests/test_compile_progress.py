@@ -10,6 +10,7 @@ import pytest
 
 from adacd_hil.compile_progress import listening
 from adacd_hil.compiled import compiled, compiling
+from adacd_hil.printable import number_of
 
 
 @compiled
@@ -40,8 +41,7 @@ def test_whoever_listens_is_told_how_far_compiling_is(monkeypatch: pytest.Monkey
     ):
         assert quarter(4.0) == 1.0
     first = int(said[0].split()[1])  # those that this process has compiled before
-    assert said[0] == f"compiling, {first} functions so far, once per version"
-    assert said[-1] == f"compiling, {first + 2} functions so far, once per version"
+    assert said[-1] == f"compiling, {number_of(first + 2, 'function')} so far, once per version"
     assert begun == [0]
     with compiling(lambda: begun.append(-1)):
         assert quarter(np.float64(8.0)) == 2.0

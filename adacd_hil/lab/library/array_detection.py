@@ -27,9 +27,9 @@ from adacd_hil.lab.offline.recording_verdict import Verdict
 from adacd_hil.lab.serial_arm.urdf import STANDARD_GRAVITY_M_S2, SerialArm, read_urdf
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.robot_description import robot_description
+from adacd_hil.printable import number_of
 from adacd_hil.records import Vector
 from adacd_hil.remedies import hint
-from adacd_hil.score.wording import number_of
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError

@@ -51,9 +51,10 @@ from adacd_hil.lab.tune.tune_roc import (
 )
 from adacd_hil.log.logged_run import Progress
 from adacd_hil.log.time_window import TimeWindow
+from adacd_hil.printable import number_of
 from adacd_hil.replay.replay import replay_many
 from adacd_hil.replay.replayed_outcome import Replay
-from adacd_hil.score.wording import found_text, number_of
+from adacd_hil.score.wording import found_text
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
