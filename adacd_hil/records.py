@@ -386,7 +386,6 @@ class SchemeOutput(NamedTuple):
     fault: FaultReason
     contact_joints: int  # bit i: joint i, counted from 0, over the threshold
     is_model_valid: bool  # theta_ff may be fed forward
-    theta_hat: Vector
     theta_ff: Vector  # parameters of the last finished adaptation, zeros before; for the feedforward
     tau_ext_hat: Vector
     contact: ContactReport | None  # set in each cycle in which a report is due, the final one last

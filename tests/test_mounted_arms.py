@@ -9,6 +9,8 @@ from long_cases import long_but
 from played_outcome import outcome_of
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
+from adacd_hil.control.operator import ScriptedOperator
+from adacd_hil.replay.replay import replay
 from adacd_hil.settings.setting_keys import apply_settings
 from firmware_sim.scenario.scenario import ScenarioOutcome
 
@@ -97,6 +99,7 @@ def test_a_stop_before_the_first_motion_is_acknowledged_and_the_run_ends(tmp_pat
     _, said = play(tmp_path, MOUNTINGS["hanging"], mounted(90.0, 20.0), still)
     assert "[ENABLE -> REACT]" in said
     assert "[STOPPED -> ENABLE]" in said
+    assert replay(tmp_path / "run" / "run.mcap", script_of=ScriptedOperator).is_identical
 
 
 def test_the_weight_of_an_arm_that_is_told_to_be_flat_is_named_with_the_mounting(tmp_path: Path) -> None:

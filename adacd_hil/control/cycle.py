@@ -349,7 +349,7 @@ class Cycle:
         At the first MONITOR compare the certificate with the link lengths. Drop a stored request that the state serves.
         """
         self._state = state
-        if state in (SchemeState.ADAPT, SchemeState.REACT) and self._enabled_cycle is None:
+        if state in POWERED and self._enabled_cycle is None:
             self._enabled_cycle = cycle
         if state is SchemeState.FAULT:
             self._faulted_cycle = cycle

@@ -7,7 +7,7 @@ begins with the first cycle's number less all whole rounds of the counter. The h
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -96,8 +96,10 @@ Mask = NDArray[np.bool_]
 class Truth:
     """The emulator's truth in some of its cycles (m,): external torque (m, 2), Nm, and the contact.
 
-    contact_link, contact_index: of the contact in a cycle; attempt: of each cycle, from 0. Of a long run it has the
-    cycles of contacts and the one after each. payload_kg (k,), theta (k, 7): with the cycles from which on they hold.
+    contact_link, contact_index: of the contact in a cycle, force_N: its size; attempt: of each cycle, from 0; time_s: s
+    since motion start, 0 until the truth is on the host's cycles. Of a long run it has the cycles of contacts and the
+    one after each. payload_kg (k,), theta (k, 7): with the cycles from which on they hold. span: cycles that the
+    emulator recorded, whichever are kept.
     """
 
     cycle: Cycles
@@ -109,14 +111,27 @@ class Truth:
     attempt: Cycles
     model_cycle: Cycles
     model_attempt: Cycles
-    force_N: Vector | None = None  # size of the contact force (m,); None: of an older emulator
-    time_s: Vector | None = None  # of its cycles (m,), since motion start; None: between those of the run
-    span: Span | None = None
-    """Cycles that the emulator recorded, whichever are kept; None: all."""
+    force_N: Vector
+    time_s: Vector
+    span: Span = Span(0, _NEVER)
 
     def covers(self, cycle: int) -> bool:
-        """Return whether the emulator recorded a cycle of the host; True without a span."""
-        return self.span is None or bool(self.span.covers(np.array(cycle)))
+        """Return whether the emulator recorded a cycle of the host."""
+        return bool(self.span.covers(np.array(cycle)))
+
+    def with_host_models(self, begins: Cycles) -> "Truth":
+        """Return the truth with the host's numbers of the cycles from which on its payloads and parameters hold.
+
+        begins: first cycle of each attempt of the run so far; payloads and parameters of later attempts are left out.
+        """
+        known = self.model_attempt < len(begins)
+        return replace(
+            self,
+            payload_kg=self.payload_kg[known],
+            theta=self.theta[known],
+            model_cycle=host_cycles(self.model_cycle, self.model_attempt, begins)[known],
+            model_attempt=self.model_attempt[known],
+        )
 
     def model_row(self, cycle: int) -> int | None:
         """Return the index, in `payload_kg` and `theta`, of the values that hold in a cycle, in the truth's own count.
@@ -130,6 +145,14 @@ class Truth:
 def is_armed_in(state: NDArray[np.uint8]) -> Mask:
     """Return for each state (n,) whether it is MONITOR, in which detection counts as armed."""
     return np.asarray(state == SchemeState.MONITOR)
+
+
+def last_armed(cycle: Cycles, state: NDArray[np.uint8], before: int = -1) -> Cycles:
+    """Return for each cycle (n,), and the one after them, the last cycle in MONITOR before it (n + 1,).
+
+    before: that of the first cycle; -1: there is none.
+    """
+    return np.maximum.accumulate(np.concatenate(([before], np.where(is_armed_in(state), cycle, before))))
 
 
 def is_interrupted(state: NDArray[np.uint8]) -> Mask:
@@ -160,8 +183,8 @@ def begins_alarm(
 ) -> NDArray[np.bool_]:
     """Return for each cycle (n,) whether an alarm begins: a reaction to a contact, not to a host that is late.
 
-    previous, state (n,): before and after the cycle. is_over (n,): a joint is over its threshold, or it is not known
-    whether one is. is_reported (n,): a report of a contact that began in this cycle.
+    previous, state (n,): before and after the cycle. is_over (n,): a joint is over its threshold. is_reported (n,): a
+    report of a contact that began in this cycle.
     """
     return enters_react(previous, state) & np.asarray(is_over | is_reported)
 
@@ -188,5 +211,4 @@ class Mismatch(NamedTuple):
     def line(self, zero_ns: int = 0) -> str:
         """Return the mismatch as one line, with the time in s since `zero_ns`."""
         time_s = (self.t_ns - zero_ns) * 1e-9
-        cycle = f"cycle {self.cycle}, " if self.cycle >= 0 else ""
-        return f"{cycle}{time_s:.6f} s: {self.name} = {self.logged} logged, {self.replayed} here"
+        return f"cycle {self.cycle}, {time_s:.6f} s: {self.name} = {self.logged} logged, {self.replayed} here"

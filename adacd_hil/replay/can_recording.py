@@ -272,7 +272,7 @@ class RecordingAlone:
         The last cycles of an attempt, in which the host disables the drives, are left out. with_frames has no effect:
         the recording has only frames.
         """
-        yield Part(list(self._stretches()), {}, (), frozenset())
+        yield Part(list(self._stretches()), {}, ())
 
     def _stretches(self) -> Iterator[CycleStretch]:
         """Yield the cycles of each attempt, without those at its end that disable the drives.

@@ -17,7 +17,7 @@ from adacd_hil.device.device_files import logged_devices, place_devices
 from adacd_hil.device.network import RESET_COMMUNICATION
 from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, SHOWN, LogError
+from adacd_hil.log.log_files import DBC_NAME, SHOWN, LogError
 from adacd_hil.log.logged_run import settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, begin_of_log, report_values
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS, joined_frames
@@ -25,7 +25,6 @@ from adacd_hil.log.types.topics import ARM, CONTACT, CYCLE, EVENTS, SCHEME
 from adacd_hil.records import CERTIFICATE_EVENTS, ArmBatch, SchemeState
 from adacd_hil.replay.logged_arms import has_arms, logged_arms
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import NMT_ID, SYNC_ID, SYNC_OVERFLOW
 from adacd_hil.wire.dbc_contract import parse_codec
@@ -281,22 +280,19 @@ def find_resets(frames: NDArray[Any]) -> Places:
 
 _TOPICS: Final = (SCHEME.name, CONTACT.name, EVENTS.name)
 CYCLES_PER_PIECE: Final = 8_000
-_SAID_BEFORE_ANCHORS: Final = frozenset({"margin"})
-_SAID: Final = _SAID_BEFORE_ANCHORS | CERTIFICATE_EVENTS
+SAID: Final = frozenset({"margin"}) | CERTIFICATE_EVENTS
 """Names of the events that the scheme itself reports."""
 
 
 class Part(NamedTuple):
     """The content of one piece of a log.
 
-    contacts: fields of each logged report, by its time, ns; events: the logged events with a name in `said`, names of
-    the events that the scheme itself reports.
+    contacts: fields of each logged report, by its time, ns; events: the logged events with a name in `SAID`.
     """
 
     stretches: Iterable[CycleStretch]
     contacts: Mapping[int, Mapping[str, Any]]
     events: Sequence[LoggedEvent]
-    said: frozenset[str]
 
 
 class LogSource:
@@ -317,7 +313,6 @@ class LogSource:
         self.metadata: Mapping[str, str] = self._stream.metadata
         self.settings = settings_of(path, self._stream.attachments)
         self.codec = codec_of(path, self._stream.attachments)
-        self._said = _SAID if _has_anchors(self._stream.attachments) else _SAID_BEFORE_ANCHORS
         self._splitter = AttemptSplitter(self._stream.epoch_ns)
 
     def _open(self, with_frames: bool) -> LogStream:
@@ -347,10 +342,10 @@ class LogSource:
                 lacks = "no frames" if self.has_arms else f"neither {ARM.name} nor frames"
                 raise LogError(f"log {self._path} has {lacks}: it can't be replayed so")
             piece = self._piece(read)
-            events = [logged for logged in self._stream.events(piece) if logged.event.name in self._said]
+            events = [logged for logged in self._stream.events(piece) if logged.event.name in SAID]
             reports = piece.series[CONTACT.name]
             contacts = dict(zip(reports.t_ns.tolist(), report_values(reports), strict=True))
-            yield Part(self._splitter.split(piece), contacts, events, self._said)
+            yield Part(self._splitter.split(piece), contacts, events)
 
     @property
     def start_ns(self) -> int:
@@ -392,9 +387,3 @@ def codec_of(path: Path, attachments: Mapping[str, bytes]) -> Codec:
     if DBC_NAME not in attachments:
         raise LogError(f"log {path} has no {DBC_NAME} attached: its frames can't be decoded")
     return parse_codec(attachments[DBC_NAME], path.with_name(DBC_NAME))
-
-
-def _has_anchors(attachments: Mapping[str, bytes]) -> bool:
-    """Return whether the log's configuration has the tare's `drift_Nm_sqrt_s`: its version knew anchors then."""
-    tare = parse_toml(attachments[CONFIG_NAME]).get("tare")
-    return isinstance(tare, dict) and "drift_Nm_sqrt_s" in tare

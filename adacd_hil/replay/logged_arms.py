@@ -10,7 +10,7 @@ from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LogStream
 from adacd_hil.log.types.topics import ARM, SCHEME
-from adacd_hil.records import ArmBatch, ArmState, FaultReason
+from adacd_hil.records import ArmBatch, FaultReason
 
 _FIELDS: Final = frozenset(member.name for member in ARM.head)
 
@@ -51,24 +51,4 @@ def logged_arms(scheme: NDArray[Any], arm: NDArray[Any], ticks: Ticks) -> ArmBat
         is_late=arm["is_late"].astype(np.bool_),
         steps=arm["steps"].astype(np.int64),
         sampled_ns=ticks.t_ns - arm["sample_age_ns"],
-    )
-
-
-def arm_at(arms: ArmBatch, row: int) -> ArmState:
-    """Return the arm's state in one cycle of a batch, by the cycle's index `row`; its vectors are views."""
-    return ArmState(
-        cycle=int(arms.cycle[row]),
-        t_ns=int(arms.t_ns[row]),
-        periods=int(arms.periods[row]),
-        q=arms.q[row],
-        dq=arms.dq[row],
-        tau_J=arms.tau_J[row],
-        age_q=tuple(arms.age_q[row].tolist()),
-        age_tau_J=tuple(arms.age_tau_J[row].tolist()),
-        is_enabled=bool(arms.is_enabled[row]),
-        is_complete=bool(arms.is_complete[row]),
-        fault=FaultReason(arms.fault[row]),
-        is_late=bool(arms.is_late[row]),
-        steps=int(arms.steps[row]),
-        sampled_ns=int(arms.sampled_ns[row]),
     )

@@ -12,7 +12,7 @@ A replay of a stretch begins with the log too, because the state of filters and 
 ends with the stretch, and compares and reports only the cycles in it.
 """
 
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -27,10 +27,9 @@ from adacd_hil.log.logged_run import Milestones, Mismatch, Progress, is_armed_in
 from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.printable import number_of
-from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
+from adacd_hil.records import ArmBatch, Event, Request, SchemeState
 from adacd_hil.replay.can_recording import RecordingAlone
-from adacd_hil.replay.log_source import CycleStretch, LogSource, Part
-from adacd_hil.replay.logged_arms import arm_at
+from adacd_hil.replay.log_source import SAID, CycleStretch, LogSource, Part
 from adacd_hil.replay.replayed_outcome import OutcomeGatherer, Replay
 from adacd_hil.replay.scheme_comparison import (
     TOLERANCE,
@@ -46,6 +45,10 @@ from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
 
 _PROGRESS_CYCLES: Final = 200_000
+_OTHER_FRAMES: Final = "a setting is another by which the arm takes its frames: they are decoded, which takes longer"
+_NO_ARM: Final = (
+    "the log has no /arm, as an older one or one without a cycle: its frames are decoded, which takes longer"
+)
 
 ReplaySource = LogSource | RecordingAlone
 Watch = Callable[[int, Ticks, SchemeBatch], None]
@@ -112,9 +115,6 @@ class _Player:
         self._asking = asking
         self._checks_arms = checks_arms
         self._pipeline: Pipeline  # of the attempt, with which the first stretch begins
-        self._state: SchemeState
-        self._reports: dict[int, ContactReport] = {}  # of this part, by time
-        self._cycles: dict[int, int] = {}
 
     def play(self, stretch: CycleStretch, arms: ArmBatch, part: Part, is_told: bool) -> SchemeBatch:
         """Run the scheme on the cycles of `stretch`, in piece `part` of the log; gather and return its decisions.
@@ -130,7 +130,7 @@ class _Player:
         self.gatherer.add_stretch(ticks, batch, stretch.follows_gap)
         asked = None
         if self._asking is not None and stretch.requests is not None and stretch.is_exact:
-            asked = self._asking.requests(ticks, batch)
+            asked = self._asking.requests(ticks, batch, stretch.requests)
         if is_told:
             self.cycles += len(ticks.cycle)
             monitored = ticks.cycle[is_armed_in(batch.state)]
@@ -148,11 +148,11 @@ class _Player:
         part: Part,
         events: Sequence[Event],
     ) -> None:
-        """Compare the decisions about a stretch's cycles with the log, and the requests and events in them.
+        """Compare the decisions about a stretch's cycles with the log, and the requests, reports and events in them.
 
-        Compare states that were decoded from frames, too. Keep the contacts' reports for `compare_contacts`. Do nothing
-        if this variant isn't compared, or the log lacks its decisions, requests, or earlier cycles of the attempt.
-        asked: requests of the script (n,); None: each logged one that is a Request is believed.
+        Compare states that were decoded from frames, too. Do nothing if this variant isn't compared, or the log lacks
+        its decisions, requests, or earlier cycles of the attempt. asked: requests of the script (n,); None: each logged
+        one that is a Request is believed.
         """
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
             return
@@ -163,17 +163,16 @@ class _Player:
         if asked is None:  # whatever a user could ask is believed
             asked = _known(stretch.requests)
         self.comparison.compare_requests(ticks, stretch.requests, asked)
-        times = ticks.t_ns[batch.contact_places].tolist()
-        self._reports |= zip(times, batch.contacts, strict=True)
-        self._cycles |= zip(times, ticks.cycle[batch.contact_places].tolist(), strict=True)
-        logged = [event for event in part.events if ticks.t_ns[0] <= event.t_ns <= ticks.t_ns[-1]]
-        replayed = [event for event in events if event.name in part.said]
+        first_ns, last_ns = ticks.t_ns[[0, -1]].tolist()
+        reports = {t_ns: fields for t_ns, fields in part.contacts.items() if first_ns <= t_ns <= last_ns}
+        self.comparison.compare_contacts(reports, ticks, batch)
+        logged = [event for event in part.events if first_ns <= event.t_ns <= last_ns]
+        replayed = [event for event in events if event.name in SAID]
         self.comparison.compare_events(logged, replayed, ticks)
 
     def _begin(self) -> None:
         """Begin an attempt: a new pipeline in INIT, and a new attempt of the script."""
         self._pipeline = new_pipeline(self.settings)
-        self._state = SchemeState.INIT
         self.attempts += 1
         if self._asking is not None:
             self._asking.begin_attempt()
@@ -181,45 +180,28 @@ class _Player:
     def _run(self, stretch: CycleStretch, arms: ArmBatch) -> SchemeBatch:
         """Run the scheme on a stretch and return its decisions, with the logged requests.
 
-        If the requests are unknown, the script makes them, or without a script there are none.
+        If the requests are unknown, the script makes them, cycle by cycle.
         """
         if stretch.requests is not None:
             return self._pipeline.run(arms, _known(stretch.requests))
-        outputs = []
+        assert self._asking is not None
+        batches = []
         for row, cycle in enumerate(stretch.ticks.cycle.tolist()):
-            request = Request.NONE if self._asking is None else self._asking.ask(cycle, self._state)
-            output = self._pipeline.step(arm_at(arms, row), request)
-            if self._asking is not None:
-                self._asking.note_request(cycle, request, self._state, output.state)
-            self._state = output.state
-            outputs.append(output)
-        return _columns(outputs)
-
-    def compare_contacts(self, logged: Mapping[int, Mapping[str, Any]], exact: Sequence[tuple[int, int]]) -> None:
-        """Compare a part's contact reports with the logged ones, then forget them.
-
-        logged: fields of the logged reports by time, ns. exact: first and last time, ns, of each stretch that can be
-        compared.
-        """
-        if self.comparison is not None:
-            judged = {t_ns: record for t_ns, record in logged.items() if any(a <= t_ns <= b for a, b in exact)}
-            self.comparison.compare_contacts(judged, self._reports, self._cycles)
-        self._reports, self._cycles = {}, {}
+            before = self._pipeline.state
+            request = self._asking.ask(cycle, before)
+            batches.append(self._pipeline.run(_arms_of(arms, slice(row, row + 1)), np.array([request], np.uint8)))
+            self._asking.note_request(cycle, request, before, self._pipeline.state)
+        return _joined(batches)
 
 
-def _columns(outputs: Sequence[SchemeOutput]) -> SchemeBatch:
-    """Return the outputs of single cycles as one batch of arrays, with a list of the contacts' reports."""
-    states = (("state", np.uint8), ("previous_state", np.uint8), ("fault", np.uint8), ("reaction", np.uint8))
-    wholes = (("cycle", np.int64), ("contact_joints", np.int64), ("is_model_valid", np.bool_), *states)
-    columns: dict[str, Any] = {
-        name: np.array([getattr(output, name) for output in outputs], kind) for name, kind in wholes
-    }
-    contacts = {row: output.contact for row, output in enumerate(outputs) if output.contact is not None}
+def _joined(batches: Sequence[SchemeBatch]) -> SchemeBatch:
+    """Return batches of one cycle each as one."""
+    names = set(SchemeBatch._fields) - {"contacts", "contact_places"}
+    columns: dict[str, Any] = {name: np.concatenate([getattr(batch, name) for batch in batches]) for name in names}
     return SchemeBatch(
         **columns,
-        block=np.array([output.block for output in outputs]),
-        contacts=list(contacts.values()),
-        contact_places=np.array(list(contacts), np.int64),
+        contacts=[report for batch in batches for report in batch.contacts],
+        contact_places=np.flatnonzero([len(batch.contacts) for batch in batches]),
     )
 
 
@@ -240,10 +222,10 @@ def replay_source(
 
     Only settings equal to the source's are compared with the log. truth: the true contacts, None if unknown; remarks:
     on it, for the notes of each replay. progress: prints a line about the work. tolerance: of the comparison; None:
-    exact, or `TOLERANCE` where the log's numbers were computed on another kind of machine. script_of: as for `replay`.
-    stretch: the part that is compared and reported; watch sees all from the beginning of the log on. by_frames: decode
-    the frames and compare each state with the log's. Raises LogError if the source can't be read, or no cycle of the
-    stretch can be replayed; ConfigError if a device can't be loaded.
+    exact, or `TOLERANCE` where the log's numbers were computed on another kind of machine. script_of: as for `replay`;
+    a recording without a log needs it. stretch: the part that is compared and reported; watch sees all from the
+    beginning of the log on. by_frames: decode the frames and compare each state with the log's. Raises LogError if the
+    source can't be read, or no cycle of the stretch can be replayed; ConfigError if a device can't be loaded.
     """
     bounds_ns = EVER_NS if stretch.is_whole else stretch.bounds_ns(source.start_ns)
     if tolerance is None:
@@ -255,8 +237,8 @@ def replay_source(
         asking = Asking(settings, script_of) if is_scripted and script_of is not None else None
         players.append(_Player(settings, truth, comparison, asking, by_frames))
     reader = _ArmReader(source, variants, by_frames)
-    if not by_frames and (reason := why_frames(source, variants)):
-        progress(reason)
+    if reader.needs_frames and not (by_frames or source.is_recording):
+        progress(_OTHER_FRAMES if source.has_arms else _NO_ARM)
     done = 0
     milestones = Milestones(lambda count: progress(f"{count} cycles replayed"), _PROGRESS_CYCLES)
     for part in _one_ahead(_decoded(source, reader, bounds_ns[1])):
@@ -305,12 +287,11 @@ def _replay_part(
     bounds_ns: tuple[int, int],
     watch: Watch | None,
 ) -> int:
-    """Replay the cycles of a piece of the log with each player, compare its contacts' reports; return their number.
+    """Replay the cycles of a piece of the log with each player; return their number.
 
     bounds_ns: begin and end of the reported time, on the run's clock; cycles from the end on are not replayed, but
     count in the number. watch: called with each player's decisions.
     """
-    exact: list[tuple[int, int]] = []
     cycles, (part, arms_of_part) = 0, decoded
     for stretch, all_arms in zip(part.stretches, arms_of_part, strict=True):
         for mine, rows, is_told in _split(stretch, bounds_ns):
@@ -318,11 +299,7 @@ def _replay_part(
                 batch = player.play(mine, _arms_of(arms, rows), part, is_told)
                 if watch is not None:
                     watch(place, mine.ticks, batch)
-            if mine.is_exact and is_told:
-                exact.append((int(mine.ticks.t_ns[0]), int(mine.ticks.t_ns[-1])))
         cycles += len(stretch.ticks.cycle)
-    for player in players:
-        player.compare_contacts(part.contacts, exact)
     return cycles
 
 
@@ -396,21 +373,6 @@ class _ArmReader:
         return [batches[key] for key in self._keys]
 
 
-def why_frames(source: ReplaySource, variants: Sequence[Settings]) -> str:
-    """Return the reason why frames must be decoded, which takes longer, in one line; "" if the log's states serve.
-
-    "" also for a recording, which has only frames.
-    """
-    if source.is_recording:
-        return ""
-    if not source.has_arms:
-        return "the log has no /arm, as an older one or one without a cycle: its frames are decoded, which takes longer"
-    own = _decoding_key(source.settings)
-    if all(_decoding_key(settings) == own for settings in variants):
-        return ""
-    return "a setting is another by which the arm takes its frames: they are decoded, which takes longer"
-
-
 def _decoding_key(settings: Settings) -> Any:
     """Return the settings that determine how frames become the arm's states."""
     arm = settings.arm
@@ -455,7 +417,6 @@ def _result(
         arms_compared=0 if comparison is None else comparison.arms,
         attempts=player.attempts,
         states=tuple(each for each in gatherer.transitions if each.t_ns >= first_ns),
-        contacts=tuple(each for each in gatherer.reports if each[0] >= first_ns),
         adaptation_s=tuple(took_s for t_ns, took_s in gatherer.adaptations if t_ns >= first_ns),
         parameters=dict(zip(player.settings.estimator.parameter_names, gatherer.theta_hat, strict=False)),
         score=score,

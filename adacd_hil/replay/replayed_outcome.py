@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.logged_run import Mismatch, begins_alarm, host_span, is_armed_in
-from adacd_hil.records import JOINTS, LEARNING, PARAMETER_UNITS, ContactReport, FaultReason, SchemeState
+from adacd_hil.log.logged_run import Mismatch, begins_alarm, host_span, is_armed_in, last_armed
+from adacd_hil.records import JOINTS, LEARNING, PARAMETER_UNITS, FaultReason, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.score.emulator_truth import HostCycles, KnownContacts, placed_contacts
-from adacd_hil.score.judge import Detection, Score, TrueContact, judge
+from adacd_hil.score.judge import Detection, Score, TrueContact, is_about_weight, judge
 from adacd_hil.score.smallest_push import PUSH_WITHIN, PushGatherer
 from adacd_hil.score.wording import NONE, found_text, why_not_found
 from adacd_hil.settings.configuration import Settings
@@ -37,15 +37,22 @@ class StateChange(NamedTuple):
     fault: FaultReason
 
 
+class _Moment(NamedTuple):
+    """The cycle of an alarm, the state before it, and the last cycle in MONITOR before it, -1: there is none."""
+
+    cycle: int
+    before: int
+    armed: int
+
+
 class OutcomeGatherer:
-    """Gathers the outcome of one replay from its decisions: states, reports, alarms, adaptations, sensitivity, score.
+    """Gathers the outcome of one replay from its decisions: states, alarms, adaptations, sensitivity, score.
 
     `truth`: the true contacts, None if unknown. behind_gap_ns, detections_ns: times of alarms, ns.
     """
 
     def __init__(self, settings: Settings, truth: KnownContacts | None) -> None:
         self.transitions: list[StateChange] = []
-        self.reports: list[tuple[int, ContactReport]] = []  # with the time of each, ns
         self.adaptations: list[tuple[int, float | None]] = []  # beginning, ns; duration, s, None: never in MONITOR
         self.theta_hat: tuple[float, ...] = ()
         self._settings = settings
@@ -53,7 +60,8 @@ class OutcomeGatherer:
         self._contacts: list[TrueContact] = []  # of this attempt, on the host's cycles
         self._kept: list[HostCycles] = []  # of this attempt
         self._placed: list[TrueContact] = []  # on the host's clock
-        self._alarms: list[tuple[int, Detection]] = []  # with the cycle of each
+        self._alarms: list[tuple[Detection, _Moment]] = []
+        self._armed = -1  # last cycle in MONITOR
         self.behind_gap_ns: set[int] = set()
         """Times of the alarms before which the log lacks cycles of their attempt."""
         self._begins: list[int] = []  # first cycle of each attempt
@@ -68,7 +76,7 @@ class OutcomeGatherer:
         self._was_over = False
 
     def add_stretch(self, ticks: Ticks, batch: SchemeBatch, follows_gap: bool = False) -> None:
-        """Gather states, contacts and alarms of the next cycles, from the scheme's decisions in them.
+        """Gather states and alarms of the next cycles, from the scheme's decisions in them.
 
         follows_gap: the log lacks cycles of the attempt before them; the times of their alarms then also go into
         `behind_gap_ns`, as they may stem from the jump.
@@ -86,9 +94,12 @@ class OutcomeGatherer:
         is_reported[batch.contact_places] = [report.cycle for report in batch.contacts] == ticks.cycle[
             batch.contact_places
         ]
+        armed = last_armed(ticks.cycle, batch.state, self._armed)
+        self._armed = int(armed[-1])
         for row in np.flatnonzero(begins_alarm(batch.previous_state, batch.state, over, is_reported)).tolist():
+            moment = _Moment(int(ticks.cycle[row]), int(batch.previous_state[row]), int(armed[row]))
             is_armed = bool(is_armed_in(batch.previous_state[row]))
-            self._alarms.append((int(ticks.cycle[row]), Detection(int(ticks.t_ns[row]), is_armed)))
+            self._alarms.append((Detection(int(ticks.t_ns[row]), is_armed), moment))
             if follows_gap:
                 self.behind_gap_ns.add(int(ticks.t_ns[row]))
         for row in np.flatnonzero(batch.state != batch.previous_state).tolist():
@@ -101,8 +112,6 @@ class OutcomeGatherer:
                     FaultReason(batch.fault[row]),
                 )
             )
-        for row, report in zip(batch.contact_places.tolist(), batch.contacts, strict=True):
-            self.reports.append((int(ticks.t_ns[row]), report))
         self.theta_hat = tuple(batch.block[-1, self._theta].tolist())
 
     def _keep(self, ticks: Ticks, batch: SchemeBatch) -> None:
@@ -173,7 +182,7 @@ class OutcomeGatherer:
         self.end_attempt()
         self._begins += [cycle] * (attempt + 1 - len(self._begins))  # also of those that a recording lacks
         if self._truth is not None:
-            mine = (contact for contact in self._truth[0] if contact.attempt == attempt)
+            mine = (contact for contact in self._truth.contacts if contact.attempt == attempt)
             self._contacts = [contact.counted_from(cycle) for contact in mine]
         self._was_over = False
 
@@ -191,13 +200,13 @@ class OutcomeGatherer:
     @property
     def detections_ns(self) -> list[int]:
         """Times of all alarms, ns, the ones behind gaps included."""
-        return [alarm.t_ns for _, alarm in self._alarms]
+        return [alarm.t_ns for alarm, _ in self._alarms]
 
     def uncovered(self, cycle: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return for each cycle (n,) of the attempts so far whether the truth lacks it; all False without a truth."""
         if self._truth is None:
             return np.zeros(len(cycle), np.bool_)
-        return ~host_span(self._truth[1], np.array(self._begins or [0])).covers(cycle)
+        return ~host_span(self._truth.span, np.array(self._begins or [0])).covers(cycle)
 
     def score(self) -> Score | None:
         """Return which true contacts were detected and which alarms were false; None if the truth is not known.
@@ -206,10 +215,15 @@ class OutcomeGatherer:
         """
         if self._truth is None:
             return None
-        is_known = (~self.uncovered(np.array([cycle for cycle, _ in self._alarms], np.int64))).tolist()
+        is_known = (~self.uncovered(np.array([moment.cycle for _, moment in self._alarms], np.int64))).tolist()
+        rows = self._truth.rows.with_host_models(np.array(self._begins or [0]))
         alarms = [
-            replace(alarm, is_known=known and alarm.t_ns not in self.behind_gap_ns)
-            for (_, alarm), known in zip(self._alarms, is_known, strict=True)
+            replace(
+                alarm,
+                is_known=known and alarm.t_ns not in self.behind_gap_ns,
+                is_weight=is_about_weight(rows, self._settings, *moment),
+            )
+            for (alarm, moment), known in zip(self._alarms, is_known, strict=True)
         ]
         return judge(self._placed, alarms, self._crossings)
 
@@ -220,13 +234,13 @@ class Replay:
 
     cycles: replayed in the stretch, of which `compared` were compared with the log; compared is 0 if the settings are
     not the log's. arms_compared: cycles whose state, decoded from frames, was compared with the log's. monitored_s: in
-    MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in `mismatched_fields`. contacts:
-    reports with their times, ns. parameters: the estimate of the last cycle. score: of contacts and alarms that begin
-    in the stretch, None if the truth is not known. adaptation_s: duration of each adaptation that begins in it, None if
-    it never got to MONITOR. zero_ns: time of the first ADAPT of the log, 0 without one. ending: the last change of
-    state, which may be before the stretch, None without one. threshold_Nm: median in MONITOR of each joint's lowest
-    threshold of all channels, nan if it never monitored; push_Nm: of the smallest push found within `PUSH_WITHIN`, an
-    estimate, () in the paper's scheme. attempts, threshold_Nm, push_Nm: from the log's beginning.
+    MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in `mismatched_fields`. parameters:
+    the estimate of the last cycle. score: of contacts and alarms that begin in the stretch, None if the truth is not
+    known. adaptation_s: duration of each adaptation that begins in it, None if it never got to MONITOR. zero_ns: time
+    of the first ADAPT of the log, 0 without one. ending: the last change of state, which may be before the stretch,
+    None without one. threshold_Nm: median in MONITOR of each joint's lowest threshold of all channels, nan if it never
+    monitored; push_Nm: of the smallest push found within `PUSH_WITHIN`, an estimate, () in the paper's scheme.
+    attempts, threshold_Nm, push_Nm: from the log's beginning.
     """
 
     settings: Settings
@@ -236,7 +250,6 @@ class Replay:
     arms_compared: int
     attempts: int
     states: tuple[StateChange, ...]
-    contacts: tuple[tuple[int, ContactReport], ...]
     adaptation_s: tuple[float | None, ...]
     parameters: dict[str, float]
     score: Score | None
@@ -382,7 +395,7 @@ def as_json(found: Replay) -> dict[str, Any]:
     """Return a replay's outcome in plain values for JSON; times in s since the first ADAPT, see `Replay.time_s`.
 
     Contacts are the true ones; they, false alarms and missed contacts are None if the truth is not known. Left out are
-    thresholds that aren't finite, contact reports, the comparison with the log, and notes.
+    thresholds that aren't finite, the comparison with the log, and notes.
     """
     return {
         "cycles": found.cycles,

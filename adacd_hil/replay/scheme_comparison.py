@@ -28,6 +28,7 @@ from adacd_hil.log.types.topics import ARM, CONTACT, EVENTS, SCHEME
 from adacd_hil.records import JOINTS, ArmBatch, ContactReport, Event, Layout, Request, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.scheme.supervisor.kept_request import KeptRequest
+from adacd_hil.scheme.supervisor.supervisor import POWERED, among
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.run_settings import OperatorSettings
 
@@ -70,7 +71,13 @@ class SchemeComparison:
         self._shown = shown
         self._tolerance = tolerance
         self._layout: Layout = layout_of(settings)
-        self._names = _place_names(settings, self._layout)
+        parameters, further = settings.estimator.parameter_names, settings.further_names
+        self._names = {  # of the values of fields that aren't by joint
+            "theta_hat": parameters,
+            "paper_theta_hat": parameters,
+            "theta_further": further,
+            "theta_std": (*parameters, *further),
+        }
         self._scales: dict[str, Vector] = {}
 
     def compare(self, scheme: Series, ticks: Ticks, batch: SchemeBatch) -> None:
@@ -148,7 +155,7 @@ class SchemeComparison:
         self.count += len(rows)
         self.fields[f"{topic}.{name}"] += len(rows)
         for row, column in zip(rows[: self._shown].tolist(), columns[: self._shown].tolist(), strict=True):
-            names = self._names.get(name, ("",) if logged.shape[1] == 1 else _JOINTS)
+            names = self._names.get(name) or _places(logged.shape[1])
             values = (repr(side[row, column].item()) for side in (logged, replayed))
             self._keep(Mismatch(topic, name, names[column], int(ticks.cycle[row]), int(ticks.t_ns[row]), *values))
 
@@ -169,16 +176,14 @@ class SchemeComparison:
         self.mismatches = sorted(self.mismatches, key=lambda mismatch: mismatch.cycle)[: self._shown]
         return tuple(self.mismatches)
 
-    def compare_contacts(
-        self, logged: Mapping[int, Mapping[str, Any]], replayed: Mapping[int, ContactReport], cycles: Mapping[int, int]
-    ) -> None:
-        """Compare contact reports, each by the time at which it was made, ns; count and keep the mismatches.
+    def compare_contacts(self, logged: Mapping[int, Mapping[str, Any]], ticks: Ticks, batch: SchemeBatch) -> None:
+        """Compare the contact reports of a stretch, each by the time at which it was made.
 
-        A report without a counterpart is one. cycles: number of the cycle at each of these times; -1 stands for an
-        unknown one.
+        Count and keep the mismatches; a report without a counterpart is one. logged: fields by time, ns.
         """
+        replayed = dict(zip(ticks.t_ns[batch.contact_places].tolist(), batch.contacts, strict=True))
         for t_ns in sorted({*logged, *replayed}):
-            where = (cycles.get(t_ns, -1), t_ns)
+            where = (int(ticks.cycle[_row_at(ticks, t_ns)]), t_ns)
             theirs, ours = logged.get(t_ns), replayed.get(t_ns)
             if theirs is None or ours is None:
                 said = [("no report" if side is None else "a report") for side in (theirs, ours)]
@@ -208,7 +213,7 @@ class SchemeComparison:
             if theirs is not None and theirs.event == ours:
                 continue
             name = ours.name if theirs is None else theirs.event.name
-            row = 0 if theirs is None else int(np.searchsorted(ticks.t_ns, theirs.t_ns, "right")) - 1
+            row = 0 if theirs is None else _row_at(ticks, theirs.t_ns)
             cycle, t_ns = int(ticks.cycle[row]), int(ticks.t_ns[row])
             logged_text, replayed_text = _event_text(theirs and theirs.event), _event_text(ours)
             self.add_mismatch(Mismatch(EVENTS.name, name, "", cycle, t_ns, logged_text, replayed_text))
@@ -233,6 +238,11 @@ class SchemeComparison:
             self._interrupt = None
 
 
+def _row_at(ticks: Ticks, t_ns: int) -> int:
+    """Return the index of the last cycle up to a time that is not before the first."""
+    return int(np.searchsorted(ticks.t_ns, t_ns, "right")) - 1
+
+
 def _event_text(event: Event | None) -> str:
     return repr("no event" if event is None else f"{event.level}: {event.message}")
 
@@ -252,22 +262,8 @@ def _contact_values(logged: Mapping[str, Any], replayed: ContactReport) -> Itera
             yield field, "", theirs, type(theirs)(ours)
 
 
-def _place_names(settings: Settings, layout: Layout) -> dict[str, tuple[str, ...]]:
-    """Return the names of the values of each field of the block, by field, such as a1 or joint 1; see `_names_of`."""
-    parameters, further = settings.estimator.parameter_names, settings.further_names
-    named = {
-        "theta_hat": parameters,
-        "paper_theta_hat": parameters,
-        "theta_further": further,
-        "theta_std": (*parameters, *further),
-    }
-    return {field.name: _names_of(field.name, field.size, named) for field in layout.fields}
-
-
-def _names_of(name: str, size: int, named: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Return the names of a field's values: those in `named`, else "" for one value, joints, or channels and joints."""
-    if name in named:
-        return tuple(named[name])
+def _places(size: int) -> tuple[str, ...]:
+    """Return the places of a field's values (size): "" for one value, the joints, or the joints of each channel."""
     if size == 1:
         return ("",)
     if size == JOINTS:
@@ -332,18 +328,19 @@ class Asking:
         """
         self._kept.ask(request, previous)
         self._kept.serve((state,))
-        if state is SchemeState.ADAPT and self._enabled is None:
+        if state in POWERED and self._enabled is None:
             self._enabled = cycle
 
-    def requests(self, ticks: Ticks, batch: SchemeBatch) -> NDArray[np.uint8]:
+    def requests(self, ticks: Ticks, batch: SchemeBatch, logged: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the user's requests in a stretch (n,), as `ask` does, given the scheme's states in it.
 
-        NONE until the drives are enabled. Keep a request to finish or to change the payload for the next attempt if the
-        scheme hasn't served it. Call it for all stretches of an attempt, in the order of time.
+        NONE until the drives are enabled, and where a logged request (n,) is of the host's own checks: it asks no user
+        then. Keep a request to finish or to change the payload for the next attempt if the scheme hasn't served it.
+        Call it for all stretches of an attempt, in the order of time.
         """
         asked = np.zeros(len(ticks.cycle), np.uint8)
         if self._enabled is None:
-            enabled = np.flatnonzero(batch.state == SchemeState.ADAPT)
+            enabled = np.flatnonzero(among(POWERED)[batch.state])
             if enabled.size == 0:
                 return asked
             self._enabled = int(ticks.cycle[enabled[0]])
@@ -351,7 +348,7 @@ class Asking:
         else:
             first = 0
         served = 0
-        for row in self._rows(ticks, batch, first):
+        for row in self._rows(ticks, batch, np.isin(logged, _OWN_CHECKS), first):
             self._kept.serve(batch.state[served:row])
             served = row
             previous = SchemeState(batch.previous_state[row])
@@ -360,10 +357,11 @@ class Asking:
         self._kept.serve(batch.state[served:])
         return asked
 
-    def _rows(self, ticks: Ticks, batch: SchemeBatch, first: int) -> list[int]:
+    def _rows(self, ticks: Ticks, batch: SchemeBatch, is_own: NDArray[np.bool_], first: int) -> list[int]:
         """Return the indices of the cycles from `first` on in which the script could make a request.
 
         Also those in which its wait begins anew, and `first`: a request left by the attempt before may be made in it.
+        In place of a cycle in which the host's own checks request (is_own) the one after it.
         """
         assert self._enabled is not None
         is_due = np.zeros(len(ticks.cycle), np.bool_)
@@ -373,7 +371,8 @@ class Asking:
             is_due |= is_stopped | np.concatenate(([self._was_stopped], is_stopped[:-1]))
             self._was_stopped = bool(is_stopped[-1])
         elapsed_s = (ticks.cycle - self._enabled) * self._period_s
-        is_alive = batch.previous_state != SchemeState.FAULT
+        is_alive = ~is_own & (batch.previous_state != SchemeState.FAULT)
         for at_s in self._times_s:  # as many cycles as others may be due before it, one each
             is_due[np.flatnonzero((elapsed_s >= at_s) & is_alive)[: len(self._times_s) + 1]] = True
-        return [row for row in np.flatnonzero(is_due).tolist() if row >= first]
+        is_due[1:] |= is_own[:-1]
+        return [row for row in np.flatnonzero(is_due & ~is_own).tolist() if row >= first]

@@ -94,7 +94,6 @@ class _TruthRows:
     """Keeps rows of /truth, piece by piece: of one contact in progress in bounded memory."""
 
     def __init__(self) -> None:
-        self._has_force = True
         self._kept: list[NDArray[Any]] = []
         self._kept_rows = 0
         self._first: NDArray[Any] | None = None
@@ -134,7 +133,6 @@ class _TruthRows:
         for name in _ROW.names or ():
             if name in truth.fields:
                 rows[name] = records[name].reshape(rows[name].shape)
-        self._has_force = self._has_force and "contact_force" in truth.fields
         before = rows[:1] if self._last is None else self._last
         is_anew = np.diff(rows["cycle"], prepend=before["cycle"]) < 0
         rows["attempt"] = before["attempt"] + np.cumsum(is_anew)
@@ -202,7 +200,8 @@ class _TruthRows:
             contact_index=rows["contact_index"].copy(),
             payload_kg=payload[:, 0],
             theta=theta,
-            force_N=rows["contact_force"].copy() if self._has_force else None,
+            force_N=rows["contact_force"].copy(),
+            time_s=np.zeros(len(rows)),
             attempt=rows["attempt"].copy(),
             model_cycle=cycle,
             model_attempt=attempt,
@@ -326,12 +325,16 @@ def threshold_in_force(threshold: Vector, settings: Settings) -> Vector:
     return np.where(np.isfinite(threshold), threshold, settings.detector.threshold_Nm)
 
 
-KnownContacts = tuple[tuple[TrueContact, ...], EmulatorSpan]
-"""The true contacts of a run, in order, and of which cycles they are known."""
+class KnownContacts(NamedTuple):
+    """The true contacts of a run, in order, of which cycles they are known, and the rows of the truth."""
+
+    contacts: tuple[TrueContact, ...]
+    span: EmulatorSpan
+    rows: Truth
 
 
 def contacts_beside(path: Path, progress: Progress = lambda _: None) -> KnownContacts | None:
-    """Return the true contacts of a log's run from truth.mcap beside it, and the cycles of which they are known.
+    """Return what truth.mcap beside a log knows of the true contacts of its run.
 
     None without that file, if the emulator never cycled, and for a truth of another run or one whose heads can't be
     read, of which `progress` gets a line. Raises LogError for a truth with invalid metadata.
@@ -343,4 +346,4 @@ def contacts_beside(path: Path, progress: Progress = lambda _: None) -> KnownCon
         progress(f"{problem}; it is left out")
         return None
     table = read_truth(truth)
-    return None if table.span is None else (true_contacts(table.rows), table.span)
+    return None if table.span is None else KnownContacts(true_contacts(table.rows), table.span, table.rows)

@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.log.logged_run import Truth, cycle_offsets
-from adacd_hil.records import JOINTS, ContactReport, Vector
+from adacd_hil.records import JOINTS, ContactReport, SchemeState, Vector
+from adacd_hil.settings.configuration import Settings
 
 Times = NDArray[np.int64]
 
@@ -35,7 +36,8 @@ class Detection:
     """An alarm of a scheme. is_armed: raised by armed detection, in MONITOR.
 
     is_known: the truth covers that time, or there is no truth. row: index in the run's cycles, -1: unknown. first,
-    last: its report at the alarm, and the newest one of the same contact; None without a report.
+    last: its report at the alarm, and the newest one of the same contact; None without a report. is_weight: it is about
+    the weight of a payload, see `is_about_weight`.
     """
 
     t_ns: int
@@ -44,6 +46,20 @@ class Detection:
     row: int = -1
     first: ContactReport | None = None
     last: ContactReport | None = None
+    is_weight: bool = False
+
+
+def is_about_weight(truth: Truth, settings: Settings, cycle: int, before: int, armed: int) -> bool:
+    """Return whether an alarm in a cycle is about the weight of a payload that the scheme has not learnt yet.
+
+    It is, under gravity, if the state before is PAYLOAD, and the true payload differs from that in `armed`, the last
+    cycle in MONITOR before. False without such a cycle (-1), or if the truth has no payload. Cycles are counted as
+    those of the truth's payloads.
+    """
+    if armed < 0 or before != SchemeState.PAYLOAD or not settings.estimator.gravity:
+        return False
+    known, now = truth.model_row(armed), truth.model_row(cycle)
+    return known is not None and now is not None and bool(truth.payload_kg[known] != truth.payload_kg[now])
 
 
 def begins_of(at: NDArray[Any], pause: float, last: float | None = None) -> NDArray[np.bool_]:
@@ -81,8 +97,8 @@ class TrueContact:
     rows: int = 0
     cycle: Times = field(default_factory=lambda: np.zeros(0, np.int64), compare=False, repr=False)
     tau_ext: Vector = field(default_factory=lambda: np.zeros((0, JOINTS)), compare=False, repr=False)
-    force_N: Vector | None = field(default=None, compare=False, repr=False)
-    time_s: Vector | None = field(default=None, compare=False, repr=False)
+    force_N: Vector = field(default_factory=lambda: np.zeros(0), compare=False, repr=False)
+    time_s: Vector = field(default_factory=lambda: np.zeros(0), compare=False, repr=False)
 
     @property
     def onset(self) -> int:
@@ -174,11 +190,13 @@ def contacts_of_alarms(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[An
 def judge(contacts: Sequence[TrueContact], alarms: Sequence[Detection], crossings_ns: Sequence[int] = ()) -> Score:
     """Return when each true contact was found, and which alarms are false or not judged; all in the order of time.
 
-    Alarms that the truth doesn't cover are not judged, even if they find a contact. crossings_ns: times at which a
+    Alarms about a payload's weight are left out. Those that the truth doesn't cover are not judged, even if they find a
+    contact. crossings_ns: times at which a
     scheme, replayed on another scheme's motion, first exceeds a threshold. While it still reacts it can raise no alarm:
     then, if no alarm finds a contact that began meanwhile (`is_reacting`), a crossing does.
     """
     onsets, until = explained_times(contacts)
+    alarms = [alarm for alarm in alarms if not alarm.is_weight]
     about = contacts_of_alarms(np.array([alarm.t_ns for alarm in alarms], np.int64), onsets, until).tolist()
     found = _first(about, [alarm.t_ns for alarm in alarms])
     crossed = _first(contacts_of_alarms(np.array(crossings_ns, np.int64), onsets, until).tolist(), crossings_ns)
@@ -288,12 +306,14 @@ def forgotten_after_s(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: f
     return (1.0 + math.log(max(1.0, excess))) / a_rad_s
 
 
-def true_contacts(truth: Truth, first_number: int = 1) -> tuple[TrueContact, ...]:
-    """Return the true contacts in a truth, numbered from `first_number`.
+def true_contacts(truth: Truth | None, first_number: int = 1) -> tuple[TrueContact, ...]:
+    """Return the true contacts in a truth, numbered from `first_number`; () without a truth.
 
     Each has its own rows of the truth, and the one after them if that is of the same attempt. Their cycles are the
     emulator's; their times on a run's clock are still 0.
     """
+    if truth is None:
+        return ()
     found = []
     bounds = contact_bounds(truth.contact_index, truth.attempt)
     for number, (start, end) in enumerate(bounds, first_number):
@@ -307,8 +327,8 @@ def true_contacts(truth: Truth, first_number: int = 1) -> tuple[TrueContact, ...
                 rows=end - start,
                 cycle=truth.cycle[rows],
                 tau_ext=truth.tau_ext[rows],
-                force_N=None if truth.force_N is None else truth.force_N[rows],
-                time_s=None if truth.time_s is None else truth.time_s[rows],
+                force_N=truth.force_N[rows],
+                time_s=truth.time_s[rows],
             )
         )
     return tuple(found)

@@ -164,7 +164,7 @@ def _read_value(key: str, text: str) -> Any:
     """Parse a text as a TOML value.
 
     Return a text that is no TOML as a string, for words without quotes. Raises ConfigError for such a text if it is
-    empty or holds a quote, bracket, brace, `=`, `#` or newline, and for a value beyond the limits of `parse_toml`.
+    empty or holds a quote, bracket, brace, `=`, `#` or newline, and for a value that `parse_toml` refuses.
     """
     try:
         return parse_toml(f'"{key}" = {text}')[key]

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.lab.score.evaluation import RunGatherer, evaluate
+from adacd_hil.lab.score.metrics import Metrics
 from adacd_hil.lab.score.run_arrays import (
     CertifiedStream,
     CycleColumns,
@@ -14,6 +16,7 @@ from adacd_hil.lab.score.run_arrays import (
     PaperStream,
     Run,
     columns_of_records,
+    is_realtime,
 )
 from adacd_hil.log.logged_run import Truth
 from adacd_hil.log.recording.recorder import Recorder
@@ -46,13 +49,19 @@ def make_run(
     reason: FaultReason = FaultReason.DRIVE,
     **changes: Any,
 ) -> Run:
-    """Make a run that stays in the given states for the given numbers of cycles. reason: of all of its faults."""
+    """Make a run that stays in the given states for the given numbers of cycles, both joints at 0.25 rad.
+
+    reason: of all of its faults.
+    """
     states = [state for state, cycles in stays or PAPER_LIKE for _ in range(cycles)]
     count = len(states)
     cycle = FIRST_CYCLE + np.arange(count, dtype=np.int64)
     threshold = np.full((count, 2), np.inf)
     threshold[np.isin(states, (M, R, S))] = 0.15
     zeros = np.zeros(count, dtype=np.int64)
+    t_ns = EPOCH_NS + cycle * 1_000_000
+    zero_ns = int(t_ns[states.index(A) if A in states else 0])
+    q = np.full((count, 2), 0.25)
     truth = Truth(
         cycle=cycle.copy(),
         tau_ext=np.zeros((count, 2)),
@@ -64,10 +73,11 @@ def make_run(
         model_cycle=cycle,
         model_attempt=zeros,
         force_N=np.zeros(count),
+        time_s=(t_ns - zero_ns) * 1e-9,
     )
     run = Run(
         cycle=cycle,
-        t_ns=EPOCH_NS + cycle * 1_000_000,
+        t_ns=t_ns,
         state=np.array(states, dtype=np.uint8),
         fault=np.where(np.array(states) == SchemeState.FAULT, reason, FaultReason.NONE).astype(np.uint8),
         tau_ext_hat=np.zeros((count, 2)),
@@ -75,9 +85,7 @@ def make_run(
         theta_hat=np.zeros((count, 7)),
         threshold=threshold,
         reports=(),
-        timing=CycleColumns(
-            EPOCH_NS + cycle * 1_000_000, {**dict.fromkeys(CycleRecord._fields, zeros), "cycle": cycle}
-        ),
+        timing=CycleColumns(t_ns, {**dict.fromkeys(CycleRecord._fields, zeros), "cycle": cycle}),
         truth=truth if has_truth else None,
         settings=parse(Settings, {"name": "hand-made", "arm": {"cad_theta": list(CAD_THETA)}}),
         metadata={
@@ -90,6 +98,9 @@ def make_run(
         },
         frames=12,
         dropped=0,
+        contact_joints=np.ones(count, np.uint8),
+        motion=MeasuredMotion(q, 0.0 * q, 0.0 * q),
+        zero_ns=zero_ns,
     )
     return replace(run, **changes)
 
@@ -187,27 +198,31 @@ def touched_run() -> Run:
     )
 
 
+def gathered_of(run: Run) -> RunGatherer:
+    """Sum up a run that has all of its cycles."""
+    gathered = RunGatherer(run.settings, not is_realtime(run))
+    gathered.add_times(run.timing, run.cycle, run.state)
+    gathered.untouched.add_untouched(run, run)
+    return gathered
+
+
+def evaluated(run: Run) -> Metrics:
+    """Evaluate a run that has all of its cycles."""
+    return evaluate(run, gathered_of(run))
+
+
 def with_columns(run: Run, **columns: NDArray[np.int64]) -> Run:
     """Give the run other columns of /cycle."""
     return replace(run, timing=replace(run.timing, columns={**run.timing.columns, **columns}))
 
 
-def with_motion(run: Run) -> Run:
-    """Give the run measured motion: both joints rest at 0.25 rad."""
-    q = np.full((len(run.cycle), 2), 0.25)
-    return replace(run, motion=MeasuredMotion(q, 0.0 * q, 0.0 * q))
-
-
-def like_an_old_log(run: Run) -> Run:
-    """Take away what /cycle did not have at first."""
-    names = ("cycle", "lateness_ns", "feedback_ns", "command_ns", "overruns", "frames_missing", "commands_late")
-    return replace(run, timing=replace(run.timing, columns={name: run.timing[name] for name in names}))
-
-
 def without_cycles(run: Run) -> Run:
     """Give a log that ended before its first cycle."""
-    names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold")
-    return replace(run, timing=columns_of_records([], []), **{name: getattr(run, name)[:0] for name in names})
+    names = (
+        "cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold", "contact_joints",
+    )  # fmt: skip
+    nothing = {name: getattr(run, name)[:0] for name in names}
+    return replace(run, timing=columns_of_records([], []), zero_ns=0, **nothing)
 
 
 def record(path: Path, run: Run, attachments: dict[str, bytes] | None = None, clock: str = "lockstep") -> None:
@@ -237,7 +252,7 @@ def record(path: Path, run: Run, attachments: dict[str, bytes] | None = None, cl
             state = SchemeState(run.state[row])
             joints = int(state is SchemeState.REACT)
             output = SchemeOutput(
-                cycle, state, state, FaultReason.NONE, joints, False, run.theta_hat[row], run.theta_hat[row],
+                cycle, state, state, FaultReason.NONE, joints, False, run.theta_hat[row],
                 run.tau_ext_hat[row], None, blocks[row],
             )  # fmt: skip
             times = CycleRecord(*(int(run.timing[name][row]) for name in CycleRecord._fields))

@@ -8,6 +8,8 @@ from analysis.replay_rig import settings_of_run, write_candump
 
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.log_files import LogError
+from adacd_hil.log.reader import read_log
+from adacd_hil.records import ContactReport
 from adacd_hil.replay.can_recording import RecordingAgainstLog, RecordingAlone, load_recording
 from adacd_hil.replay.replay import replay_source
 from adacd_hil.wire.dbc_contract import load_codec
@@ -33,9 +35,12 @@ def test_without_the_log_the_script_plays_the_user(log, whole, tmp_path):
     path = tmp_path / "bus.log"
     write_candump(log, path)
     source = RecordingAlone(path, settings_of_run(), CODEC)
-    found = replay_source(source, [source.settings], script_of=ScriptedOperator)[0]
+    reports: list[ContactReport] = []
+    (found,) = replay_source(
+        source, [source.settings], script_of=ScriptedOperator, watch=lambda _, __, batch: reports.extend(batch.contacts)
+    )
     assert [each[:1] + each[2:] for each in found.states] == [each[:1] + each[2:] for each in whole.states]
-    assert found.contacts[-1][1] == whole.contacts[-1][1]
+    assert reports == [report for _, report in read_log(log, ("/contact",)).contacts]
     assert found.compared == 0
     assert found.notes == ()
 

@@ -5,10 +5,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_made_run import FIRST_CYCLE, A, C, M, P, R, S, contact_report, make_certified_run, make_run, react, touch
+from hand_made_run import (
+    FIRST_CYCLE,
+    A,
+    C,
+    M,
+    P,
+    R,
+    S,
+    contact_report,
+    evaluated,
+    make_certified_run,
+    make_run,
+    react,
+    touch,
+)
 
 from adacd_hil.lab.report.run_page import report_page
-from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.lab.score.run_arrays import split_sections
 from adacd_hil.lab.score.run_judge import step_delay_s
@@ -18,7 +31,7 @@ from adacd_hil.score.wording import NONE
 
 
 def test_an_adaptation_lasts_until_its_model_is_certified():
-    assert evaluate(make_certified_run()).adaptation_s == pytest.approx({"A": 1.0, "D": 0.5})
+    assert evaluated(make_certified_run()).adaptation_s == pytest.approx({"A": 1.0, "D": 0.5})
 
 
 @pytest.mark.parametrize(
@@ -47,7 +60,7 @@ def test_a_contact_belongs_to_the_section_that_it_interrupts(stays, sections):
 
 def test_the_last_test_of_each_adaptation_and_their_number_are_told():
     run = make_certified_run((A, 100), (C, 30), (A, 100), (C, 70), (M, 100))
-    evidence = evaluate(run).evidence
+    evidence = evaluated(run).evidence
     assert (evidence.tests, evidence.test_s) == ({"A": 2}, {"A": pytest.approx(0.07)})
 
 
@@ -58,7 +71,7 @@ def touched_in_adaptation():
 
 
 def test_a_contact_while_adapting_has_its_delay_and_is_not_missed():
-    metrics = evaluate(touched_in_adaptation())
+    metrics = evaluated(touched_in_adaptation())
     (contact,) = metrics.contacts
     assert (contact.state, contact.is_armed, contact.delay_ms) == ("ADAPT", False, pytest.approx(2.0))
     assert "1 more while it was not watched (1 of them detected)" in metrics.verdict
@@ -66,7 +79,7 @@ def test_a_contact_while_adapting_has_its_delay_and_is_not_missed():
 
 
 def margin_of(run, label, channel):
-    return tuple(evaluate(run).evidence.margins[label][channel].margin)
+    return tuple(evaluated(run).evidence.margins[label][channel].margin)
 
 
 def test_the_margin_is_the_smallest_threshold_over_residual():
@@ -77,7 +90,7 @@ def test_the_margin_is_the_smallest_threshold_over_residual():
     run.certified.tau_ext[500, 1] = 0.025
     assert margin_of(run, "B", 4) == pytest.approx((2.0, 5.0))
     assert margin_of(run, "A", 1) == pytest.approx((4.0, 4.0))  # while it learns
-    assert evaluate(run).evidence.smallest_margin == pytest.approx(2.0)
+    assert evaluated(run).evidence.smallest_margin == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("make", [make_run, make_certified_run])
@@ -94,7 +107,7 @@ def test_a_run_whose_joint_was_blind_is_not_good(make, residual, threshold, is_g
         strict=True,
     ):
         values[1350:, ..., 1] = changed
-    found = evaluate(run)
+    found = evaluated(run)
     assert found.is_clean == is_good
     assert [text.text.partition(" of MONITOR")[0] for text in found.findings if text.is_bad] == (
         [] if is_good else ["a joint was blind in 25 %"]
@@ -109,7 +122,7 @@ def test_a_touch_is_no_small_margin():
 
 
 def test_every_parameter_has_its_standard_deviation():
-    estimates = evaluate(make_certified_run()).evidence.estimates["D"]
+    estimates = evaluated(make_certified_run()).evidence.estimates["D"]
     assert list(estimates)[-2:] == ["cross_talk1", "cross_talk2"]
     assert (estimates["lag1"].value, estimates["lag1"].std) == (0.001, 0.01)
 
@@ -118,11 +131,11 @@ def test_promotions_are_counted_over_the_certificates():
     run = make_certified_run()
     run.certified.promotions[3000:5000] = 2.0
     run.certified.promotions[8000:] = 1.0
-    assert evaluate(run).evidence.promotions == 3
+    assert evaluated(run).evidence.promotions == 3
 
 
 def beside(run):
-    return evaluate(run).evidence.paper_beside
+    return evaluated(run).evidence.paper_beside
 
 
 def test_the_papers_scheme_is_armed_later_on_the_same_stream_or_never():
@@ -134,8 +147,8 @@ def test_the_papers_scheme_is_armed_later_on_the_same_stream_or_never():
 
 def test_a_scheme_that_did_not_run_beside_has_no_figures():
     run = make_certified_run()
-    assert "5 s" in {row.beside for row in evaluate(run).paper}
-    assert {row.beside for row in evaluate(replace(run, beside=None)).paper} == {NONE}
+    assert "5 s" in {row.beside for row in evaluated(run).paper}
+    assert {row.beside for row in evaluated(replace(run, beside=None)).paper} == {NONE}
 
 
 def certificates(*levels):
@@ -144,22 +157,22 @@ def certificates(*levels):
 
 
 def test_a_verdict_says_that_nothing_anchors_the_offsets_of_some_certificate():
-    metrics = evaluate(certificates("info", "warning"))
+    metrics = evaluated(certificates("info", "warning"))
     assert not metrics.evidence.is_anchored
     assert (
         "offsets that nothing anchors; the paper's scheme on the same stream took 2.00 s and 2.00 s" in metrics.verdict
     )
-    assert "anchors" not in evaluate(certificates("info", "info")).verdict
+    assert "anchors" not in evaluated(certificates("info", "info")).verdict
 
 
 def test_a_certificate_that_was_taken_back_is_what_the_verdict_begins_with_and_the_run_is_not_good():
     why = "2 contacts look like 0.50 ± 0.06 kg picked up: the certificate is taken back"
     run = replace(make_certified_run(), events=(LoggedEvent(5, Event("warning", "revoked", why)),))
-    metrics = evaluate(run)
+    metrics = evaluated(run)
     assert metrics.evidence.revoked == (why,)
     assert metrics.verdict.startswith(f"{why}; ")
     assert not metrics.is_clean
-    assert evaluate(make_certified_run()).is_clean
+    assert evaluated(make_certified_run()).is_clean
 
 
 def touched_beside(row, crossing):
@@ -181,8 +194,8 @@ def touched_beside(row, crossing):
 def test_the_papers_scheme_detects_where_it_crosses_its_threshold(row, crossing, told, missed):
     run = touched_beside(row, crossing)
     theirs = beside(run)
-    assert [(c["number"], c["is_armed"], c["delay_ms"]) for c in theirs.contacts] == [told]
-    assert (theirs.missed, theirs.false_alarms, evaluate(run).missed) == (missed, 0, 0)
+    assert [(c.number, c.is_armed, c.delay_ms) for c in theirs.contacts] == [told]
+    assert (theirs.missed, theirs.false_alarms, evaluated(run).missed) == (missed, 0, 0)
 
 
 def test_a_false_alarm_of_the_papers_scheme_counts_once():
@@ -214,7 +227,7 @@ def reported(**said):
     run.truth.force_N[3000:3250] = 15.0
     run.state[3002:3100] = R
     made = contact_report(int(run.cycle[3002]), link=2, direction=(1, 1), location=Location.KNOWN, **said)
-    return evaluate(replace(run, reports=(made,))).contacts[0]
+    return evaluated(replace(run, reports=(made,))).contacts[0]
 
 
 def test_a_contact_says_what_its_report_says():
@@ -234,7 +247,7 @@ def test_what_a_report_does_not_know_is_none():
     assert (contact.force_N, contact.lever_m) == (None, None)
     run = react(make_run(), 2000, tau_ext_peak=(5.0, 0.0))  # the paper's scheme seeks no place
     touch(run, 1995, 100, (5.0, 0.0))
-    contact = evaluate(run).contacts[0]
+    contact = evaluated(run).contacts[0]
     assert (contact.location, contact.force_N, contact.kind) == (None, None, None)
 
 
@@ -247,7 +260,7 @@ def test_a_step_behind_two_low_passes_takes_as_long_as_it_should_and_below_the_t
 def test_the_law_is_that_of_the_fastest_channel():
     run = make_certified_run()
     touch(run, 3000, 250, (1.0, 0.0))
-    (contact,) = evaluate(react(run, 3001)).contacts
+    (contact,) = evaluated(react(run, 3001)).contacts
     assert contact.law_ms == pytest.approx(-1e3 * math.log1p(-0.1) / 200.0)
     assert contact.ideal_ms == pytest.approx(1.0)
 
@@ -264,4 +277,4 @@ def test_a_force_is_told_as_far_as_it_is_known(location, words):
     run = touched_beside(3000, 3005)
     made = contact_report(int(run.cycle[3001]), location=location, force_N=-14.2, force_sigma=0.5)
     run = replace(run, reports=(made,))
-    assert f"<dt>{words}</dd>" in report_page(evaluate(run), run, ReportSource("run.mcap"))
+    assert f"<dt>{words}</dd>" in report_page(evaluated(run), run, ReportSource("run.mcap"))

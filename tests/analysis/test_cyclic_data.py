@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_made_run import EPOCH_NS, A, M, make_certified_run, make_run, with_columns, without_cycles
+from hand_made_run import EPOCH_NS, A, M, evaluated, make_certified_run, make_run, with_columns, without_cycles
 
 from adacd_hil.lab.report.next_steps import next_steps
-from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.lab.score.report_wording import percent_text
-from adacd_hil.lab.score.run_arrays import CheckCounts, CycleColumns
+from adacd_hil.lab.score.run_arrays import CheckCounts, columns_of_records
 from adacd_hil.lab.score.run_faults import find_breaks, find_faults
 from adacd_hil.lab.score.verdict import data_text
 from adacd_hil.log.reader import LoggedEvent
@@ -28,7 +27,7 @@ def missing_frames(run, rows, age=0):
 
 
 def gather_data(run):
-    return evaluate(run).data
+    return evaluated(run).data
 
 
 def said(t_ms, name, message, level="error"):
@@ -60,10 +59,7 @@ def test_the_worst_second_tells_whether_too_much_was_missing(stays, rows, worst)
 
 
 def test_a_log_that_lacks_the_counts_is_not_called_free_of_losses():
-    run = make_run((A, 100))
-    older = replace(run, timing=CycleColumns(run.timing.t_ns, {"cycle": run.timing["cycle"]}))
-    assert data_text(gather_data(older)) == "whether cyclic data was late or lost is not in the log"
-    nothing = replace(run, timing=CycleColumns(run.timing.t_ns[:0], {}))
+    nothing = replace(make_run((A, 100)), timing=columns_of_records([], []))
     assert data_text(gather_data(nothing)) == "whether cyclic data was late or lost is not in the log"
 
 
@@ -96,9 +92,9 @@ def test_counts_that_begin_anew_are_of_another_attempt():
 
 def test_a_device_over_its_limit_makes_a_run_unclean():
     run = make_run()
-    assert evaluate(run).is_clean is True
+    assert evaluated(run).is_clean is True
     run = checks(run, (1000, (0, 0), (0, 0)), (2000, (0, 0), (0, 51)))
-    metrics = evaluate(run)
+    metrics = evaluated(run)
     assert metrics.is_clean is False
     assert metrics.data.excesses == ("repeated frames of sensor1: 5.1 % of the cycles of a second, 1 % allowed",)
     assert metrics.verdict.endswith("; repeated frames of sensor1 in 5.1 %, more than allowed.")
@@ -115,7 +111,7 @@ def test_a_share_is_never_rounded_to_nothing(share, text):
 def test_a_margin_below_1_makes_a_run_unclean_and_stands_in_front():
     run = make_certified_run()
     run.certified.tau_ext[2000, 0, 0] = 0.244
-    metrics = evaluate(run)
+    metrics = evaluated(run)
     assert metrics.verdict.partition("; ")[0].endswith("smallest margin 0.41")
     assert metrics.is_clean is False
 
@@ -127,21 +123,21 @@ def test_a_fault_has_the_cause_that_was_logged():
     run = make_run(
         (A, 500), (SchemeState.FAULT, 10), events=(said(400, "supervisor", "no"), said(500, "supervisor", CAUSE))
     )
-    assert evaluate(run).verdict.startswith("The run ended in FAULT (DRIVE) at 0.50 s: Drive2: over-current;")
+    assert evaluated(run).verdict.startswith("The run ended in FAULT (DRIVE) at 0.50 s: Drive2: over-current;")
 
 
 def test_a_run_that_went_on_after_a_fault_did_not_end_in_it():
     run = make_run((A, 500), (SchemeState.FAULT, 10), (SchemeState.INIT, 10), (A, 500), (M, 100))
-    verdict = evaluate(run).verdict
+    verdict = evaluated(run).verdict
     assert verdict.startswith("FAULT (DRIVE) at 0.50 s, after which it began anew; no contact")
     assert "the model was not identified at first, then in 0.50 s" in verdict
-    assert evaluate(run).is_clean is False
+    assert evaluated(run).is_clean is False
 
 
 def test_of_many_faults_the_first_and_the_last_are_said():
     run = make_run((A, 500), *[(SchemeState.FAULT, 10), (A, 90)] * 3, (SchemeState.FAULT, 10))
     assert [fault.is_last for fault in find_faults(run)] == [False, False, False, True]
-    many, last, *_ = evaluate(run).verdict.split("; ")
+    many, last, *_ = evaluated(run).verdict.split("; ")
     assert many.startswith("4 faults, the first and the last: FAULT (DRIVE) at 0.50 s")
     assert last == "the run ended in FAULT (DRIVE) at 0.80 s"
 
@@ -149,10 +145,10 @@ def test_of_many_faults_the_first_and_the_last_are_said():
 def test_a_run_that_never_booted_has_its_cause_as_verdict():
     events = (said(0, "run", "no boot-up from Drive1\x1b[2J within 2 s"),) * 2
     run = without_cycles(make_run((A, 1), has_truth=False, events=events))
-    metrics = evaluate(run)
+    metrics = evaluated(run)
     assert metrics.verdict == "No cycle was run: no boot-up from Drive1\\u001b[2J within 2 s."
     assert metrics.is_clean is False
-    assert evaluate(replace(run, events=())).verdict == "No cycle was run: the log does not say why."
+    assert evaluated(replace(run, events=())).verdict == "No cycle was run: the log does not say why."
 
 
 @pytest.mark.parametrize(
@@ -165,7 +161,7 @@ def test_a_run_that_never_booted_has_its_cause_as_verdict():
 )
 def test_what_broke_a_run_off_makes_it_unclean_and_did_not_end_it_if_cycles_follow(changes, is_last):
     run = make_run(**changes)
-    metrics = evaluate(run)
+    metrics = evaluated(run)
     assert find_breaks(run) == (("can0 went away", is_last),)
     assert ("began anew: can0 went away; no contact" in metrics.verdict, metrics.is_clean) == (not is_last, False)
     assert next_steps(metrics, run, ReportSource("run.mcap"))[0][0].command.startswith("adacd-hil demo ")
@@ -174,4 +170,4 @@ def test_what_broke_a_run_off_makes_it_unclean_and_did_not_end_it_if_cycles_foll
 @pytest.mark.parametrize(("metadata", "is_clean"), [({}, True), ({"scenario": "paper"}, False)])
 def test_an_interruption_breaks_off_what_has_a_script(metadata, is_clean):
     events = (said(9000, "interrupted", "the run was interrupted", "warning"),)
-    assert evaluate(make_run(events=events, metadata=metadata)).is_clean is is_clean
+    assert evaluated(make_run(events=events, metadata=metadata)).is_clean is is_clean

@@ -124,7 +124,7 @@ def test_a_truth_that_goes_on_with_the_next_host_covers_this_one_to_its_end():
     nothing = np.zeros(1, np.int64)
     truth = Truth(
         nothing, np.zeros((1, 2)), np.zeros(1), np.full(1, -1.0), np.zeros(1), np.zeros((1, 7)),
-        model_cycle=nothing, model_attempt=nothing, attempt=nothing,
+        model_cycle=nothing, model_attempt=nothing, attempt=nothing, force_N=np.zeros(1), time_s=np.zeros(1),
     )  # fmt: skip
     rows = TruthTable(truth, {}, "", ((0, 3), (1, 50)))
     begun = ([0], [0, 480])

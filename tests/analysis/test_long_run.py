@@ -7,11 +7,11 @@ from functools import partialmethod
 import numpy as np
 import pytest
 from called import called
-from hand_made_run import make_certified_run, make_run, react, record, record_truth, touch, with_columns
+from hand_made_run import evaluated, make_certified_run, make_run, react, record, record_truth, touch, with_columns
 
 from adacd_hil.lab.logs.cut import cut
 from adacd_hil.lab.report import run_reading
-from adacd_hil.lab.report.page import left_out_text, shown_contacts
+from adacd_hil.lab.report.page import left_out_text, shown_contacts, stretch_text
 from adacd_hil.lab.report.report_files import write_run_report
 from adacd_hil.lab.report.report_json import report_json
 from adacd_hil.lab.report.run_reading import TruthClock, read_run
@@ -155,12 +155,15 @@ def test_what_happens_to_the_arm_after_its_host_has_died_is_none_of_the_host_s()
         contact_link=np.array([0.0, 0.0, 0.0, 2.0, 2.0]),
         contact_index=np.array([-1.0, -1.0, -1.0, 0.0, 0.0]),
         force_N=np.arange(5.0),
+        time_s=np.zeros(5),
         model_attempt=np.zeros(1, np.int64),
         model_cycle=np.array([98]),
         payload_kg=np.zeros(1),
         theta=np.zeros((1, 7)),
     )
-    truth = host_truth(TruthTable(rows, {}, ""), np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5))
+    truth = host_truth(
+        TruthTable(rows, {}, "", ((0, 98), (0, 102))), np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5)
+    )
     assert truth.cycle.tolist() == [98, 99, 100]
     columns = (truth.tau_ext, truth.contact_link, truth.contact_index, truth.force_N, truth.time_s)
     assert [len(column) for column in columns] == [3] * 5
@@ -176,7 +179,7 @@ def test_a_stretch_has_the_cycles_between_its_times_which_count_from_motion_star
     run = stretched(certified, 2.8, 3.5).run
     assert ((run.t_ns[[0, -1]] - start_ns) * 1e-9).tolist() == pytest.approx([2.8, 3.499])
     assert run.time_s()[0] == pytest.approx(2.75)
-    metrics = evaluate(run)
+    metrics = evaluated(run)
     assert metrics.adaptation_s == {}  # which is no fault of a stretch
     assert not any("adapt" in finding.text for finding in metrics.findings)
 
@@ -195,12 +198,26 @@ def test_a_stretch_that_would_cut_something_is_widened(certified, asked, found):
     assert run.stretch.found[1] <= found[1] + 1e-9
 
 
+@pytest.mark.parametrize(
+    ("bounds", "text"),
+    [
+        ({"start_s": 2.8, "end_s": 3.5}, "from 2.8 s until 3.5 s"),
+        ({"start_s": 2.8}, "from 2.8 s"),
+        ({"end_s": 3.5}, "until 3.5 s"),
+        ({"end_s": 4.01}, "until 5.25 s, widened so that no contact and no adaptation is cut"),
+    ],
+)
+def test_the_words_for_a_stretch_name_the_bounds_that_it_has_and_say_whether_it_was_widened(certified, bounds, text):
+    run = read_run(certified, truth_of(certified), TimeWindow(**bounds)).run
+    assert stretch_text(run.stretch) == f"the log {text}"
+
+
 def test_a_contact_of_a_stretch_is_what_it_is_in_the_whole_log(certified):
-    whole = evaluate(read_run(certified, truth_of(certified)).run).contacts[1]
-    (part,) = evaluate(stretched(certified, 2.9, 4.9).run).contacts
+    whole = evaluated(read_run(certified, truth_of(certified)).run).contacts[1]
+    (part,) = evaluated(stretched(certified, 2.9, 4.9).run).contacts
     assert (part.number, replace(part, section=whole.section)) == (2, whole)
     untold = read_run(certified, None, TimeWindow(2.9, 4.9))
-    assert [contact.number for contact in evaluate(untold.run).contacts] == [2]
+    assert [contact.number for contact in evaluated(untold.run).contacts] == [2]
 
 
 def test_a_cut_says_so_and_names_the_topics_that_it_lacks(certified, tmp_path):
@@ -227,9 +244,9 @@ def test_a_stretch_beside_the_log_is_a_log_error(certified):
 
 
 def test_a_stretch_that_begins_in_the_second_attempt_knows_the_emulators_cycles(log):
-    whole = evaluate(read_run(log, truth_of(log)).run)
+    whole = evaluated(read_run(log, truth_of(log)).run)
     assert whole.fault == FaultReason.DRIVE.name
-    (expected,), (found,) = whole.contacts, evaluate(stretched(log, 4.0, 9.0).run).contacts
+    (expected,), (found,) = whole.contacts, evaluated(stretched(log, 4.0, 9.0).run).contacts
     assert (found.onset_s, found.delay_ms) == (expected.onset_s, expected.delay_ms)
 
 
@@ -246,7 +263,8 @@ def scheme_of(cycles, state=SchemeState.MONITOR):
 def truth_at(cycles, attempt=0):
     nothing = np.zeros(len(cycles))
     cycle, attempts = np.array(cycles), np.full(len(cycles), attempt)
-    truth = Truth(cycle, np.zeros((len(cycles), 2)), nothing, nothing, nothing, nothing, attempts, cycle, attempts)
+    torque = np.zeros((len(cycles), 2))
+    truth = Truth(cycle, torque, *[nothing] * 4, attempts, cycle, attempts, nothing, nothing)
     return TruthTable(truth, {}, "")
 
 
@@ -282,11 +300,11 @@ def test_the_report_of_a_stretch_says_which_it_is(certified, tmp_path):
         "motion_start_s": pytest.approx(0.05),
     }
     page = (tmp_path / "report.html").read_text()
-    assert "the log from 2.90 s until 5.25 s, widened so that no contact and no adaptation is cut" in page
+    assert "the log from 2.9 s until 5.25 s, widened so that no contact and no adaptation is cut" in page
 
 
 def test_of_many_contacts_the_first_are_listed_and_those_that_went_wrong(certified):
-    metrics = evaluate(read_run(certified, truth_of(certified)).run)
+    metrics = evaluated(read_run(certified, truth_of(certified)).run)
     right = next(contact for contact in metrics.contacts if contact.direction_ok)
     many = tuple(replace(right, number=number) for number in range(1, 51))
     wrong = replace(right, number=51, link=2, link_detected=1, link_ok=False)
@@ -306,7 +324,7 @@ def test_many_adaptations_are_summed_up():
 
 def test_of_many_stays_those_that_are_narrower_than_a_mark_are_drawn_together():
     stays = [(SchemeState.MONITOR, 3), (SchemeState.REACT, 1)] * 800 + [(SchemeState.MONITOR, 4000)]
-    timeline = timeline_of(run := make_run(*stays), evaluate(run))
+    timeline = timeline_of(run := make_run(*stays), evaluated(run))
     marks = [mark.title for mark in timeline["states"]]
     assert 100 < len(marks) < 650  # 612 fit beside each other
     assert sum(int(mark.split()[0]) for mark in marks if "states" in mark) == 1600

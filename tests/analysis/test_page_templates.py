@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hand_made_run import make_certified_run, react, touch, touched_run, with_motion
+from hand_made_run import evaluated, make_certified_run, react, touch, touched_run
 from jinja2 import UndefinedError
 from parsed_page import Page
 
@@ -19,7 +19,6 @@ from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.runs.run_pages import ListedRun, runs_page, trend_page
 from adacd_hil.lab.runs.run_summary import BROKEN, CERTIFIED, GOOD, CertificateState, RunSummary
 from adacd_hil.lab.runs.run_trend import trends
-from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.lab.score.run_arrays import Run
 
@@ -61,11 +60,11 @@ def certified_run() -> Run:
     run = make_certified_run()
     touch(run, 3000, 250, (5.0, 1.0), link=2)
     run = react(run, 3005, link=2, force_N=-9.0, force_sigma=0.5, lever_m=0.2, lever_sigma=0.01)
-    return replace(with_motion(run), log_start_ns=0)
+    return replace(run, log_start_ns=0)
 
 
 def page_of(run: Run) -> str:
-    return report_page(evaluate(run), run, ReportSource("run.mcap", "cut"))
+    return report_page(evaluated(run), run, ReportSource("run.mcap", "cut"))
 
 
 def run_summaries() -> list[RunSummary]:
@@ -84,7 +83,7 @@ def page_of_a_folder(_: Run) -> str:
 
 
 def page_of_a_communication_test(run: Run) -> str:
-    timing = timing_tables(evaluate(run).timing)
+    timing = timing_tables(evaluated(run).timing)
     heading = {"over": "commtest", "headline": "good", "is_good": True, "problems": ("event: late",)}
     return render_page("communication_test_page.html.j2", "test", **heading, timing=timing)
 

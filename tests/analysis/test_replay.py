@@ -41,7 +41,7 @@ def test_a_replay_comes_to_the_same_bits_through_contact_fault_and_recovery(log,
     assert found.attempts == 2
     assert found.compared == found.cycles == len(read_log(log, ("/scheme",)).scheme)
     assert [each.fault for each in found.states if each.state is SchemeState.FAULT] == [FaultReason.DRIVE]
-    assert len(found.contacts) == len(read_log(log, ("/contact",)).contacts) > 0
+    assert len(read_log(log, ("/contact",)).contacts) > 0
 
 
 @pytest.mark.parametrize(("is_old", "by_frames"), [(False, False), (False, True), (True, False)])
@@ -137,7 +137,6 @@ def test_every_flipped_bit_is_found_and_named(log):
     assert by_field["q"].logged != by_field["q"].replayed
     assert by_field["request"].logged == "1"
     assert "/scheme.state" in by_field["state"].line()
-    assert by_field["q"]._replace(cycle=-1, t_ns=2_000_000).line().startswith("0.002000 s: /scheme.q")
 
 
 def test_an_nmt_frame_without_data_tells_nothing(log, whole):
@@ -174,8 +173,6 @@ def test_of_a_stretch_that_alone_is_compared_and_told(log, cycles_per_piece):
     assert found.score.contacts == whole.score.contacts
     assert found.states == tuple(each for each in whole.states if bounds_ns[0] <= each.t_ns < bounds_ns[1])
     assert found.ending == found.states[-1]
-    assert found.contacts == tuple(each for each in whole.contacts if bounds_ns[0] <= each[0] < bounds_ns[1])
-    assert 0 < len(found.contacts) <= len(whole.contacts)
     assert found.adaptation_s == ()
     assert 0.0 < found.monitored_s < 0.5
     after = stretched(log, TimeWindow(stretch.end_s), cycles_per_piece=cycles_per_piece)
@@ -221,6 +218,12 @@ def test_a_report_that_is_not_in_the_log_is_named(log):
     found = changed(log, lambda piece: with_records(piece, "/contact", piece.series["/contact"].records[1:]))
     (mismatch,) = found.mismatches
     assert (mismatch.name, mismatch.logged, mismatch.replayed) == ("/contact.report", "no report", "a report")
+
+
+def test_a_report_that_the_replay_does_not_make_then_is_named_with_its_cycle(log):
+    first, second = changed(log, flipping("/contact", (0, "nanosec"))).mismatches
+    assert (first.replayed, second.replayed) == ("a report", "no report")
+    assert (first.cycle, first.t_ns + 1) == (second.cycle, second.t_ns)
 
 
 @pytest.mark.parametrize("is_old", [False, True])
@@ -288,23 +291,24 @@ def test_other_settings_decide_otherwise_about_the_same_motion(log):
 
 def test_what_comes_before_or_after_the_truth_is_not_judged(log, whole):
     """As in the report: a detection there is neither right nor a false alarm, and a replay says that there are some."""
-    source, (contacts, span) = LogSource(log), contacts_beside(log)
-    attempt, onset = contacts[0].attempt, contacts[0].onset
-    first, last = span
+    source, truth = LogSource(log), contacts_beside(log)
+    attempt, onset = truth.contacts[0].attempt, truth.contacts[0].onset
+    first, last = truth.span
     assert first < (attempt, onset) < last
 
     def judged(*known: tuple[int, int]) -> tuple[int, bool, tuple[str, ...]]:
-        found = replay_source(LogSource(log), [source.settings], ((), known))[0]
+        found = replay_source(LogSource(log), [source.settings], truth._replace(contacts=(), span=known))[0]
         return len(found.score.false_alarms), found.is_whole, found.notes
 
     said = "the truth doesn't cover 1 detection, not judged"
     assert judged(first, last) == (1, True, ())
     assert judged(first, (attempt, onset - 1)) == (0, False, (said,))
     assert judged(last, last) == (0, False, (said,))
-    found = replay_source(LogSource(log), [source.settings], ((), (first, (last[0], last[1] - 100))))[0]
+    shorter = truth._replace(contacts=(), span=(first, (last[0], last[1] - 100)))
+    found = replay_source(LogSource(log), [source.settings], shorter)[0]
     assert [note.partition(" s of MONITOR")[0] for note in found.notes] == ["the truth doesn't cover 0.08"]
     assert judged(first, (whole.attempts, 0)) == (1, True, ())  # it goes on with the next host
-    assert replay_source(LogSource(log), [source.settings], (contacts, span))[0].notes == ()
+    assert replay_source(LogSource(log), [source.settings], truth)[0].notes == ()
 
 
 def test_a_truth_of_another_run_is_noted_by_each_replay(log, tmp_path):

@@ -1,4 +1,4 @@
-"""A replay comes to what the log says of a certificate and of one that was withheld; logs from before say nothing."""
+"""A replay comes to what the log says of a certificate and of one that was withheld."""
 
 from pathlib import Path
 
@@ -6,16 +6,13 @@ import pytest
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.log import reader
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import CERTIFICATE_EVENTS
-from adacd_hil.replay.log_source import LogSource
 from adacd_hil.replay.replay import replay, replay_many
 from adacd_hil.replay.replayed_outcome import side_by_side
 from adacd_hil.scheme.identify import anchor
 from adacd_hil.scheme.pipeline.certificate_watch import THIS_RUN_ONLY
 from adacd_hil.settings.setting_keys import apply_settings
-from adacd_hil.settings.toml_text import to_toml
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
@@ -79,23 +76,6 @@ def test_another_word_about_a_certificate_is_a_difference(leant_on, monkeypatch)
     assert (mismatch.topic, mismatch.field) == ("/events", "certificate")
     assert mismatch.replayed.startswith("'info: something else; a push of ")
     assert mismatch.replayed.endswith(f"; {THIS_RUN_ONLY}'")
-
-
-def test_a_log_from_before_the_anchors_is_asked_for_no_certificate(leant_on, monkeypatch):
-    (now,) = {part.said for part in LogSource(leant_on).parts(with_frames=False)}
-    assert now == {"margin", *CERTIFICATE_EVENTS}
-    config = to_toml(LogSource(leant_on).settings).split("\n")
-    before = "\n".join(line for line in config if not line.startswith("drift_Nm_sqrt_s"))
-    read_head = reader.read_head
-
-    def head_of_before(path: Path) -> reader.Extras:
-        head = read_head(path)
-        head.attachments["config.toml"] = before.encode()
-        return head
-
-    monkeypatch.setattr(reader, "read_head", head_of_before)
-    (then,) = {part.said for part in LogSource(leant_on).parts(with_frames=False)}
-    assert then == {"margin"}
 
 
 def test_threshold_and_smallest_push_are_rows_that_follow_the_settings(leant_on):

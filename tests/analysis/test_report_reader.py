@@ -6,12 +6,11 @@ from dataclasses import replace
 from importlib import resources
 
 import pytest
-from hand_made_run import A, M, make_certified_run, make_run, touched_run, without_cycles
+from hand_made_run import A, M, evaluated, make_certified_run, make_run, touched_run, without_cycles
 
 from adacd_hil.lab.report.next_steps import NextStep, next_steps, origin_words
 from adacd_hil.lab.report.page import has_paper
 from adacd_hil.lab.report.run_page import report_page
-from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.lab.score.report_wording import STATE_WORDS, uncertain_text
 from adacd_hil.lab.score.run_arrays import Run
@@ -60,7 +59,7 @@ def test_every_state_has_a_name_in_words():
 
 
 def steps_of(run: Run, source: ReportSource = SOURCE) -> list[NextStep]:
-    steps, more = next_steps(evaluate(run), run, source)
+    steps, more = next_steps(evaluated(run), run, source)
     return [*steps, *more]
 
 
@@ -81,7 +80,7 @@ def faulted(**said: str) -> Run:
 
 def test_a_fault_on_a_bus_leads_to_the_doctor_of_that_arm_and_to_nothing_else_on_the_first_screen():
     run = faulted()
-    page = report_page(evaluate(run), run, SOURCE)
+    page = report_page(evaluated(run), run, SOURCE)
     first, _, folded = page.partition("<details")
     assert re.findall(r"<code>(.*?)</code>", first) == ["adacd-hil doctor -i socketcan -c can1 --config lab.toml"]
     assert ("false alarms</dt>" in page, "adacd-hil replay run.mcap" in folded) == (False, True)
@@ -96,7 +95,7 @@ def test_a_fault_of_an_emulated_arm_is_played_again():
 
 def test_a_run_without_a_cycle_is_not_told_to_be_replayed():
     run = make_run((A, 1))
-    steps, more = next_steps(evaluate(run), on_a_bus(without_cycles(run)), SOURCE)
+    steps, more = next_steps(evaluated(run), on_a_bus(without_cycles(run)), SOURCE)
     assert ([step.command.split()[1] for step in steps], more) == (["doctor"], [])
 
 
@@ -117,8 +116,8 @@ def test_the_papers_numbers_are_those_of_its_arm_alone():
     run = touched_run()
     own = on_a_bus(run)
     own = replace(own, settings=replace(run.settings, arm=replace(run.settings.arm, link_length_m=(0.4, 0.3))))
-    assert (has_paper(evaluate(run)), has_paper(evaluate(own))) == (True, False)
-    page = report_page(evaluate(own), own, SOURCE)
+    assert (has_paper(evaluated(run)), has_paper(evaluated(own))) == (True, False)
+    page = report_page(evaluated(own), own, SOURCE)
     assert "eq. (15)" not in page.partition("How it is computed")[0]
     assert "<h2>Measured</h2>" in page
     assert "run report · arm lab · on socketcan can1</p>" in page
@@ -128,7 +127,7 @@ def test_notices_are_written_out_below_the_timeline():
     run = make_run((A, 1000), (M, 1000))
     event = LoggedEvent(int(run.t_ns[500]), Event("warning", "bus", "slow <&>"))
     run = replace(run, events=(event,) * 14)
-    page = report_page(evaluate(run), run, SOURCE)
+    page = report_page(evaluated(run), run, SOURCE)
     assert page.count("bus: slow &lt;&amp;&gt;</li>") == 12
     assert "The first 12 of 14 notices." in page
 
@@ -151,10 +150,10 @@ def test_certificates_are_told_clause_by_clause_and_one_that_was_taken_back_is_m
     told = (("certificate", "offsets anchored; a <push>"), ("revoked", "the load changed"), ("sight", "not of it"))
     events = (LoggedEvent(int(run.t_ns[1100 + row]), Event("info", *each)) for row, each in enumerate(told))
     run = replace(run, events=tuple(events))
-    page = report_page(evaluate(run), run, SOURCE)
+    page = report_page(evaluated(run), run, SOURCE)
     section = page.partition("<h2>Certificates</h2>")[2].partition("</details>")[0]
     assert re.findall(r"<li>(.*?)</li>", section) == ["offsets anchored", "a &lt;push&gt;", "the load changed"]
     assert len(re.findall(r"<p>Given at \d+\.\d\d s:", section)) == 1
     assert len(re.findall(r'<p class="bad">Taken back at', section)) == 1
     bare = replace(run, events=())
-    assert "<h2>Certificates</h2>" not in report_page(evaluate(bare), bare, SOURCE)
+    assert "<h2>Certificates</h2>" not in report_page(evaluated(bare), bare, SOURCE)

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hand_made_run import A, M, like_an_old_log, make_run, record, touched_run, without_cycles
+from hand_made_run import A, M, evaluated, gathered_of, make_run, record, touched_run, without_cycles
 from parsed_page import Page
 
 from adacd_hil.device.value_bounds import ValueBound
@@ -20,7 +20,6 @@ from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.report_files import write_report, write_run_report
 from adacd_hil.lab.report.report_json import JSON_NAME, report_json
 from adacd_hil.lab.report.report_tables import timing_tables
-from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.lab.score.verdict import headlines
 from adacd_hil.log.log_files import LogError
@@ -31,9 +30,13 @@ pytestmark = pytest.mark.slow
 SOURCE = ReportSource("run.mcap")
 
 
+def written(run, folder, source=SOURCE):
+    return write_run_report(run, folder, source, gathered_of(run))
+
+
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    return write_run_report(touched_run(), tmp_path_factory.mktemp("report"), SOURCE)
+    return written(touched_run(), tmp_path_factory.mktemp("report"))
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +125,7 @@ def test_the_table_says_what_happened(table, path, value):
 
 
 def table_of(run):
-    return report_json(evaluate(run), run.metadata, SOURCE)
+    return report_json(evaluated(run), run.metadata, SOURCE)
 
 
 def test_the_text_says_what_went_wrong_what_to_do_and_where_the_page_is(report):
@@ -137,7 +140,7 @@ def test_the_text_says_what_went_wrong_what_to_do_and_where_the_page_is(report):
 def test_the_headline_of_a_log_that_is_not_whole_is_its_problem_unless_the_run_went_wrong(report, tmp_path):
     cut = ReportSource("run.mcap", "cut after 12 s", is_complete=False)
     assert replace(report, source=cut).as_text().splitlines()[1] == f"- {cut.notice}"
-    made = write_run_report(make_run((A, 1000), (M, 1000)), tmp_path, cut)
+    made = written(make_run((A, 1000), (M, 1000)), tmp_path, cut)
     assert made.metrics.is_clean
     assert made.as_text().startswith(f"NOT GOOD: {cut.notice}\n")
     page = made.html_path.read_text(encoding="utf-8")
@@ -178,7 +181,7 @@ def test_the_policy_allows_the_pages_own_styles_and_scripts_and_nothing_else(htm
 
 @pytest.mark.long
 def test_a_page_without_traces_allows_no_script(tmp_path):
-    html = write_run_report(make_run((A, 1)), tmp_path, SOURCE).html_path.read_text(encoding="utf-8")
+    html = written(make_run((A, 1)), tmp_path).html_path.read_text(encoding="utf-8")
     (policy,) = POLICY.findall(html)
     assert ("script-src" in policy, "<script" in html) == (False, False)
 
@@ -194,10 +197,10 @@ def test_the_first_screen_of_a_bad_run_has_one_cause_and_a_list():
     run = make_run((A, 100), (SchemeState.FAULT, 50), (A, 100), (SchemeState.FAULT, 50))
     cause = "drive1: " + "an error with a very long name, " * 30
     run = replace(run, events=(LoggedEvent(int(run.t_ns[100]), Event("error", "supervisor", f"x; {cause}")),))
-    first, *further = headlines(evaluate(run), SOURCE)
+    first, *further = headlines(evaluated(run), SOURCE)
     assert (first[:30], len(first) <= 160, len(further) >= 2) == ("FAULT (DRIVE) at 0.10 s: drive1"[:30], True, True)
     again = make_run((A, 1000), (M, 500), (SchemeState.PAYLOAD, 20), (A, 100))
-    assert "not again" in headlines(evaluate(again), SOURCE)[0]
+    assert "not again" in headlines(evaluated(again), SOURCE)[0]
 
 
 def test_the_headline_of_a_value_outside_its_bounds_has_the_value():
@@ -205,7 +208,7 @@ def test_the_headline_of_a_value_outside_its_bounds_has_the_value():
     bound = ValueBound("torque_of_channel_2 - torque_of_channel_1", "Nm", 0, 1, -0.2, 0.2)
     cause = f"Sensor1: {bound.describe((4.05156, 0.2))}"
     run = replace(run, events=(LoggedEvent(int(run.t_ns[100]), Event("error", "supervisor", f"x; {cause}")),))
-    assert headlines(evaluate(run), SOURCE)[0].endswith(cause)
+    assert headlines(evaluated(run), SOURCE)[0].endswith(cause)
 
 
 def test_every_curve_of_the_plan_has_its_place_on_the_page(html):
@@ -235,7 +238,7 @@ def test_the_page_tables_the_times(html):
 
 
 def tables_of(run):
-    return render("timing.html.j2", timing=timing_tables(evaluate(run).timing), traces=None)
+    return render("timing.html.j2", timing=timing_tables(evaluated(run).timing), traces=None)
 
 
 def test_lockstep_times_are_said_to_be_modelled_and_a_run_without_a_reaction_has_dashes():
@@ -244,15 +247,8 @@ def test_lockstep_times_are_said_to_be_modelled_and_a_run_without_a_reaction_has
     assert row_of(html, "Reaction") == ["–"] * 4
 
 
-def test_an_old_log_is_tabled_with_what_it_lacks():
-    html = tables_of(like_an_old_log(touched_run()))
-    lacking = ("Compute", "Slack", "received frames dropped", "receive queue")
-    assert {row_of(html, title)[-1] for title in lacking} == {"not in this log"}
-    assert row_of(html, "Lateness") == ["4.7", "9.3", "9.3", "9.3"]
-
-
 def test_the_page_of_a_log_without_cycles_is_well_formed(tmp_path):
-    page = Page(write_run_report(without_cycles(make_run((A, 1))), tmp_path, SOURCE).html_path.read_text("utf-8"))
+    page = Page(written(without_cycles(make_run((A, 1))), tmp_path).html_path.read_text("utf-8"))
     assert page.unbalanced == []
 
 
@@ -260,7 +256,7 @@ def test_the_page_of_a_log_without_cycles_is_well_formed(tmp_path):
 def test_a_folder_that_cannot_be_made_is_a_log_error(tmp_path):
     (tmp_path / "taken").write_text("")
     with pytest.raises(LogError, match=r"report in .*taken can't be written"):
-        write_run_report(make_run((A, 10)), tmp_path / "taken", SOURCE)
+        written(make_run((A, 10)), tmp_path / "taken")
 
 
 @pytest.mark.parametrize(

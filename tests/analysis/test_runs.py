@@ -11,9 +11,10 @@ from typing import Any
 
 import pytest
 from called import called
-from hand_made_run import A, M, make_certified_run, make_run, record
+from hand_made_run import A, M, evaluated, make_certified_run, make_run, record
 
 from adacd_hil.file_access import create_file
+from adacd_hil.lab.logs.cut import cut
 from adacd_hil.lab.report.report_json import report_json
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.runs.run_summary import (
@@ -31,9 +32,9 @@ from adacd_hil.lab.runs.run_summary import (
     with_devices,
 )
 from adacd_hil.lab.runs.run_trend import trends
-from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.log.recording.recorder import Recorder
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration_files import load_settings
 
@@ -55,7 +56,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = make_run((A, 60), (M, 60))
     record(folder / "run.mcap", run)
     read = read_run(folder / "run.mcap", None)
-    table = report_json(evaluate(read.run), read.run.metadata, read.source)
+    table = report_json(evaluated(read.run), read.run.metadata, read.source)
     (folder / "report.json").write_text(json.dumps(table))
     return folder
 
@@ -116,6 +117,13 @@ def test_a_run_without_a_report_is_judged_when_asked(one):
     assert judged(quick) == asked
 
 
+def test_a_whole_log_of_which_not_all_could_be_judged_is_not_called_damaged(one, tmp_path):
+    (tmp_path / "part").mkdir()
+    cut(one / "run.mcap", tmp_path / "part" / "run.mcap", TimeWindow(end_s=0.1))
+    run = judged(summarise(tmp_path / "part"))
+    assert run.verdict.endswith(". Not all could be judged: the log is a cut of its run until 0.1 s")
+
+
 def test_a_log_is_broken_though_a_report_of_it_is_there(one):
     log = one / "run.mcap"
     log.write_bytes(log.read_bytes()[:-100])
@@ -135,7 +143,7 @@ def test_a_log_that_is_being_written_is_running(tmp_path):
 
 def test_friction_and_offsets_are_those_of_the_first_certificate_without_payload(one):
     made = make_certified_run()
-    table: dict[str, Any] = report_json(evaluate(made), made.metadata, ReportSource("run.mcap"))
+    table: dict[str, Any] = report_json(evaluated(made), made.metadata, ReportSource("run.mcap"))
     payload = {key: [9.0] * len(values) for key, values in CERTIFICATE.items()}
     table["certified"]["certificates"] = [{**payload, "is_payload": True}, {**CERTIFICATE, "is_payload": False}]
     run = reported(one, "a", table)

@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_made_run import A, C, M, make_certified_run, make_run, react, touch
+from hand_made_run import A, C, M, evaluated, make_certified_run, make_run, react, touch
 
 from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.report_tables import counted_sentence, push_table
-from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.report_wording import rate_sentence
 from adacd_hil.log.logged_run import Span
 from adacd_hil.scheme.detect.sensitivity import AGREES
@@ -24,7 +23,7 @@ def only_the_slowest(run, threshold_Nm=0.05):
 
 
 def smallest_push(run):
-    return evaluate(run).evidence.smallest_push
+    return evaluated(run).evidence.smallest_push
 
 
 def test_the_channel_that_finds_it_with_the_least_counts():
@@ -73,8 +72,8 @@ def test_cycles_that_the_truth_does_not_cover_are_no_hours_without_a_false_alarm
 
 def test_what_was_never_armed_says_nothing():
     assert smallest_push(make_certified_run((A, 1000))) is None
-    assert push_table(evaluate(make_certified_run((A, 1000))).evidence) is None
-    assert push_table(evaluate(make_run()).evidence) is None
+    assert push_table(evaluated(make_certified_run((A, 1000))).evidence) is None
+    assert push_table(evaluated(make_run()).evidence) is None
 
 
 def told(metrics):
@@ -86,10 +85,10 @@ def told(metrics):
 
 
 def test_the_rate_of_false_alarms_is_bounded_by_counting():
-    metrics = evaluate(make_certified_run())
+    metrics = evaluated(make_certified_run())
     hours = metrics.evidence.smallest_push.hours
     assert metrics.false_alarm_bound_per_h == pytest.approx(-math.log(0.05) / hours)
-    alarmed = evaluate(react(make_certified_run(), 3000, 20))
+    alarmed = evaluated(react(make_certified_run(), 3000, 20))
     assert alarmed.false_alarm_bound_per_h > 1.5 * metrics.false_alarm_bound_per_h
     assert "No false alarms in that time, which is too short to tell a rate" in told(metrics)
     assert "per hour at 95 %" not in told(metrics)
@@ -105,7 +104,7 @@ def test_the_rate_under_a_gaussian_tail_follows_from_how_near_residuals_came():
     found, nu_Hz = smallest_push(run), 10.0 / math.pi
     expected = 3600.0 * nu_Hz * (nu_Hz * found.hours * 3600.0) ** (-1.0 / 0.8**2)
     assert found.tail_rate_per_h == pytest.approx(expected)
-    assert f"; {expected:.2g} per hour if residuals have the tail of a Gaussian" in told(evaluate(run))
+    assert f"; {expected:.2g} per hour if residuals have the tail of a Gaussian" in told(evaluated(run))
 
 
 def test_the_bound_of_the_rate_is_told_from_an_hour_on():
@@ -114,13 +113,13 @@ def test_the_bound_of_the_rate_is_told_from_an_hour_on():
 
 
 def test_an_alarm_while_the_arm_learns_is_none_of_those():
-    metrics = evaluate(react(make_certified_run((A, 1000), (C, 500), (M, 4000)), 500, 20))
+    metrics = evaluated(react(make_certified_run((A, 1000), (C, 500), (M, 4000)), 500, 20))
     assert metrics.false_alarms == 1
     assert "No false alarms in that time" in told(metrics)
     assert metrics.false_alarm_bound_per_h == pytest.approx(3.0 / metrics.evidence.smallest_push.hours, rel=0.01)
 
 
 def test_without_the_truth_nobody_knows_what_a_false_alarm_was():
-    metrics = evaluate(make_certified_run(has_truth=False))
+    metrics = evaluated(make_certified_run(has_truth=False))
     assert metrics.false_alarm_bound_per_h is None
     assert "false alarm" not in told(metrics)

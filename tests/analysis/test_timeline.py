@@ -5,18 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_made_run import A, make_run, react, touch, touched_run, with_motion
+from hand_made_run import A, evaluated, make_run, react, touch, touched_run
 
 from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.run_page import CARDS, Push, contact_cards, draw_arm
 from adacd_hil.lab.report.timeline import notices_of, state_key, timeline_of
-from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, Location, SchemeState
 
 
 def drawn(run):
-    return render("timeline.html.j2", timeline=timeline_of(run, evaluate(run)), state_key=state_key(run), notices=())
+    return render("timeline.html.j2", timeline=timeline_of(run, evaluated(run)), state_key=state_key(run), notices=())
 
 
 def test_the_timeline_names_states_contacts_and_false_alarms_and_a_mark_stands_for_the_stretch_around_it():
@@ -41,7 +40,7 @@ def test_a_fault_and_a_warning_are_notices_in_the_order_of_time():
     told = ((50, "info", "fine"), (110, "error", "off"), (120, "warning", "slow"))
     events = tuple(LoggedEvent(int(run.t_ns[row]), Event(level, "bus", what)) for row, level, what in told)
     run = replace(run, events=events)
-    notices = notices_of(run, evaluate(run))
+    notices = notices_of(run, evaluated(run))
     assert [(notice.at_s, notice.is_bad, notice.text) for notice in notices] == [
         (0.1, True, "fault"),
         (pytest.approx(0.11), True, "bus: off"),
@@ -52,7 +51,7 @@ def test_a_fault_and_a_warning_are_notices_in_the_order_of_time():
 def test_many_warnings_do_not_crowd_out_a_fault():
     run = make_run((A, 500), (SchemeState.FAULT, 1))
     run = replace(run, events=tuple(LoggedEvent(int(t), Event("warning", "bus", "slow")) for t in run.t_ns[:400]))
-    notices = notices_of(run, evaluate(run))
+    notices = notices_of(run, evaluated(run))
     assert (len(notices), notices[-1].text) == (300, "fault")
 
 
@@ -86,12 +85,12 @@ def test_the_force_pushes_toward_its_side_at_its_lever_arm_whose_spread_is_a_bar
 
 
 def carded(run):
-    metrics = evaluate(run)
+    metrics = evaluated(run)
     return render("contact_cards.html.j2", cards=contact_cards(metrics, run), metrics=metrics)
 
 
 def test_each_contact_has_a_card_with_the_arm_at_its_moment():
-    run = with_motion(touched_run())
+    run = touched_run()
     run.motion.q[2005] = (1.0, -1.5)
     html = carded(run)
     assert "Arm at contact 1, joints at 1.00 and -1.50 rad, link 1 touched" in html
@@ -110,7 +109,7 @@ def test_a_card_marks_the_wrong_link_but_not_a_contact_that_detection_was_off_fo
 
 
 def test_a_known_force_is_drawn_where_the_report_has_it():
-    run = with_motion(make_run())
+    run = make_run()
     touch(run, 2000, 250, (5.0, 1.0), link=2)
     told = {"location": Location.KNOWN, "force_N": -9.0, "force_sigma": 0.5, "lever_m": 0.2, "lever_sigma": 0.01}
     html = carded(react(run, 2005, link=2, **told))

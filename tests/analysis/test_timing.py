@@ -3,18 +3,21 @@
 from dataclasses import replace
 
 import numpy as np
-from hand_made_run import A, M, R, S, like_an_old_log, make_run, with_columns
+import pytest
+from hand_made_run import A, M, R, S, evaluated, make_run, with_columns
 
 from adacd_hil.lab.report.traces import timing_track
-from adacd_hil.lab.score.evaluation import OLDEST_CYCLES, collect_evidence, evaluate, find_reactions
+from adacd_hil.lab.score.evaluation import OLDEST_CYCLES, collect_evidence, find_reactions
 from adacd_hil.lab.score.run_arrays import COMPUTE, CycleColumns, columns_of_series
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import Series
+from adacd_hil.records import CycleRecord
 
 
 def columns(**values: list[int]) -> CycleColumns:
     count = len(next(iter(values.values())))
     made = {name: np.array(column, dtype=np.int64) for name, column in values.items()}
-    usual = {"cycle": np.arange(count), "frames_missing": np.zeros(count, np.int64)}
+    usual = dict.fromkeys(CycleRecord._fields, np.zeros(count, np.int64)) | {"cycle": np.arange(count)}
     return CycleColumns(np.arange(count) * 1_000_000, usual | made)
 
 
@@ -47,15 +50,15 @@ def test_ages_are_counted_and_the_oldest_together():
 
 
 def test_lockstep_has_no_lateness_and_no_queues():
-    found = evaluate(make_run(clock="lockstep")).timing
+    found = evaluated(make_run(clock="lockstep")).timing
     assert (found.is_modelled, found.times["lateness"], set(found.queues_bytes.values())) == (True, None, {None})
-    assert evaluate(make_run(clock="realtime")).timing.times["lateness"] is not None
+    assert evaluated(make_run(clock="realtime")).timing.times["lateness"] is not None
 
 
 def test_a_reaction_takes_the_compute_time_of_the_cycle_in_which_the_state_becomes_react():
     run = make_run((A, 10), (M, 10), (R, 5), (S, 5), (M, 10), (R, 5))
     run = with_columns(run, compute_ns=1000 * np.arange(45, dtype=np.int64))
-    reaction = evaluate(run).timing.reaction
+    reaction = evaluated(run).timing.reaction
     assert (reaction["count"], reaction["p50"], reaction["max"]) == (2, 40.0, 40.0)
     assert run.timing.times_us(COMPUTE)[find_reactions(run.timing, run.cycle, run.state)].tolist() == [20.0, 40.0]
 
@@ -68,11 +71,13 @@ def test_a_reaction_is_found_by_the_number_of_its_cycle_where_cycles_are_lost():
     assert np.flatnonzero(find_reactions(begun.timing, begun.cycle, begun.state)).tolist() == [0]
 
 
-def test_columns_of_an_old_log_lack_what_it_lacks():
-    old = np.zeros(3, [("sec", "<u4"), ("nanosec", "<u4"), ("cycle", "<u8"), ("lateness_ns", "<i8")])
-    old["lateness_ns"] = (1, -2, 3)
-    made = columns_of_series(Series(old, 0))
-    assert (sorted(made.columns), made["lateness_ns"].tolist()) == (["cycle", "lateness_ns"], [1, -2, 3])
+def test_cycles_without_all_of_their_times_and_counts_are_refused_in_one_line():
+    fields = [("sec", "<u4"), ("nanosec", "<u4"), *((name, "<i8") for name in CycleRecord._fields)]
+    records = np.zeros(3, fields)
+    records["lateness_ns"] = (1, -2, 3)
+    assert columns_of_series(Series(records, 0))["lateness_ns"].tolist() == [1, -2, 3]
+    with pytest.raises(LogError, match=r"^/cycle has no transmit_queue_bytes, log_queue_bytes$"):
+        columns_of_series(Series(records[[name for name, _ in fields[:-2]]], 0))
 
 
 def panels_of(run):
@@ -102,6 +107,5 @@ def test_a_log_has_the_curves_that_it_can_have():
     run = short_run()
     whole = ["time-lateness", "time-compute", "time-sync_to_command", "time-slack", "queues"]
     assert list(panels_of(run)) == whole
-    assert list(panels_of(like_an_old_log(run))) == ["time-lateness", "time-sync_to_command"]
     lockstep = replace(run, metadata={**run.metadata, "clock": "lockstep"})
     assert list(panels_of(lockstep)) == whole[1:4]

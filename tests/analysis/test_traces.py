@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_made_run import make_certified_run, make_run, react, touch, with_motion
+from hand_made_run import evaluated, make_certified_run, make_run, react, touch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -16,7 +16,6 @@ from hypothesis.extra.numpy import arrays
 from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.timeline import traces_of
 from adacd_hil.lab.report.traces import pack, panels_of, step_of
-from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event
 
@@ -61,13 +60,9 @@ def test_a_step_is_half_the_noise_and_no_finer_than_asked_for():
 
 
 def test_a_run_has_a_panel_for_what_it_measured():
-    residuals, parameters = ["residual1", "residual2"], ["theta-a1", "theta-F_v1", "theta-F_c1"]
-    for run, measured in (
-        (with_motion(make_run()), ["q", "dq", "tau_J"]),
-        (make_run(), []),
-        (make_certified_run(), ["channels1", "channels2", "share"]),
-    ):
-        assert [panel.name for panel in panels_of(run)] == [*residuals, *measured, *parameters]
+    measured, parameters = ["residual1", "residual2", "q", "dq", "tau_J"], ["theta-a1", "theta-F_v1", "theta-F_c1"]
+    for run, channels in ((make_run(), []), (make_certified_run(), ["channels1", "channels2", "share"])):
+        assert [panel.name for panel in panels_of(run)] == [*measured, *channels, *parameters]
 
 
 def test_every_channel_of_the_bank_is_a_trace_of_its_joint():
@@ -123,12 +118,12 @@ def plan_of(html):
 @pytest.fixture(scope="module")
 def shown():
     """Give a run with a contact and a fault, and its section of traces."""
-    run = with_motion(make_run())
+    run = make_run()
     touch(run, 2000, 250, (5.0, 0.0))
     run = react(run, 2005)
     run.state[9300:] = 8
     run = replace(run, events=(LoggedEvent(int(run.t_ns[100]), Event("warning", "bus", "slow")),))
-    traces = traces_of(run, evaluate(run))
+    traces = traces_of(run, evaluated(run))
     return run, render("trace_data.html.j2", traces=traces)
 
 
@@ -153,4 +148,4 @@ def test_the_plan_shades_what_happened(shown):
 
 def test_a_run_of_one_cycle_has_no_traces():
     run = make_run((3, 1))
-    assert traces_of(run, evaluate(run)) is None
+    assert traces_of(run, evaluated(run)) is None

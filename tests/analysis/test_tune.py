@@ -384,7 +384,7 @@ SECOND_ATTEMPT = 1200
 def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
     (read,) = read_logs([log])
     cycle = read_log(log, ("/scheme",)).scheme["cycle"]
-    contacts, _ = contacts_beside(log)
+    contacts = contacts_beside(log).contacts
     assert [cycle[window.first] - SECOND_ATTEMPT for window in read.windows] == [contact.onset for contact in contacts]
     assert [(window.is_armed, window.is_chosen_on) for window in read.windows] == [(True, True)]
     for window, contact in zip(read.windows, contacts, strict=True):
@@ -397,11 +397,11 @@ def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
 
 
 def test_motion_is_free_only_as_long_as_the_truth_goes_on(log, monkeypatch):
-    (contacts, span), (whole,) = contacts_beside(log), read_logs([log])
-    ((attempt, _), _) = span
+    known, (whole,) = contacts_beside(log), read_logs([log])
+    ((attempt, _), _) = known.span
     cycle = read_log(log, ("/scheme",)).scheme["cycle"].reshape(-1)
     first, last = np.quantile(cycle[whole.motion.is_free], (0.2, 0.8), method="lower").tolist()
-    short = contacts, ((attempt, first), (attempt, last))
+    short = known._replace(span=((attempt, first), (attempt, last)))
     monkeypatch.setattr(free_motion, "contacts_beside", lambda *_: short)
     (read,) = read_logs([log])
     is_covered = (first <= cycle) & (cycle <= last)
@@ -410,9 +410,10 @@ def test_motion_is_free_only_as_long_as_the_truth_goes_on(log, monkeypatch):
 
 
 def test_contacts_of_a_later_attempt_are_counted_from_its_beginning(log, monkeypatch):
-    (first,), span = contacts_beside(log)
+    known = contacts_beside(log)
+    (first,) = known.contacts
     later = [dataclasses.replace(first, number=n + 1, attempt=n) for n in range(3)]
-    monkeypatch.setattr(free_motion, "contacts_beside", lambda *_: (later, span))
+    monkeypatch.setattr(free_motion, "contacts_beside", lambda *_: known._replace(contacts=later))
     (read,) = read_logs([log])
     cycle = read_log(log, ("/scheme",)).scheme["cycle"]
     gap = 1205 - first.onset  # between the attempts
@@ -441,9 +442,10 @@ def test_of_a_stretch_its_motion_and_its_contacts_count(log):
 
 
 def test_of_one_log_every_other_contact_is_for_choosing(log, monkeypatch):
-    (first,), span = contacts_beside(log)
+    known = contacts_beside(log)
+    (first,) = known.contacts
     three = [dataclasses.replace(first, number=number) for number in (1, 2, 3)]
-    monkeypatch.setattr(free_motion, "contacts_beside", lambda *_: (three, span))
+    monkeypatch.setattr(free_motion, "contacts_beside", lambda *_: known._replace(contacts=three))
     assert [window.is_chosen_on for window in read_logs([log])[0].windows] == [True, False, True]
 
 

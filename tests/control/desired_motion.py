@@ -31,7 +31,7 @@ class Desired:
                 self.cycle, 0, 1, self.q, self.dq, np.zeros(2), self.ages, (0, 0), True, True, FaultReason.NONE
             )
             output = SchemeOutput(
-                self.cycle, state, self.state, FaultReason.NONE, 0, True, np.zeros(7), np.zeros(7),
+                self.cycle, state, self.state, FaultReason.NONE, 0, True, np.zeros(7),
                 np.array(tau, dtype=np.float64), None, np.zeros(1), reaction,
             )  # fmt: skip
             self.reference.step(arm, output)

@@ -114,7 +114,6 @@ def make_run(count, seed=1, parameter_count=7, start_ns=5_000_000_123, has_fd=Fa
             fault=FaultReason((number + 1) % len(FaultReason)),
             contact_joints=number % 4,
             is_model_valid=number % 2 == 1,
-            theta_hat=block[:parameter_count],
             theta_ff=block[:parameter_count],
             tau_ext_hat=block[:2],
             contact=None,

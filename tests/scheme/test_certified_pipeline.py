@@ -30,6 +30,10 @@ def column(outputs, name):
     return np.array([output.block[PLACES[name]] for output in outputs])
 
 
+def theta_of(output):
+    return output.block[PLACES["theta_hat"]]
+
+
 def reports_of(outputs):
     return [output.contact for output in outputs if output.contact is not None]
 
@@ -69,8 +73,8 @@ def test_an_arm_learns_is_tested_and_monitors_and_what_passed_the_test_is_fed_fo
     assert (armed - first_in(learnt, SchemeState.ADAPT)) * PERIOD_S <= 2.5
     assert not any(output.is_model_valid or np.any(output.theta_ff) for output in learnt[:armed])
     assert all(output.is_model_valid for output in learnt[armed:])
-    np.testing.assert_array_equal(learnt[armed].theta_ff, learnt[tested + 1].theta_hat)
-    np.testing.assert_array_equal(learnt[armed].theta_ff, learnt[armed].theta_hat)
+    np.testing.assert_array_equal(learnt[armed].theta_ff, theta_of(learnt[tested + 1]))
+    np.testing.assert_array_equal(learnt[armed].theta_ff, theta_of(learnt[armed]))
 
 
 def test_each_test_of_a_fit_takes_its_whole_time(whole):
@@ -95,7 +99,7 @@ def test_a_push_while_it_monitors_is_reacted_to_reported_and_clears_and_leaves_t
     assert abs(final.tau_ext_peak[0] - 1.0) < 0.3
     assert pushed[-1].is_model_valid
     theta = column(pushed, "theta_hat")
-    np.testing.assert_array_equal(theta, np.tile(learnt[-1].theta_hat, (len(theta), 1)))
+    np.testing.assert_array_equal(theta, np.tile(theta_of(learnt[-1]), (len(theta), 1)))
 
 
 def test_a_payload_is_learnt_on_top_of_the_certified_arm_in_a_second(whole):
@@ -104,11 +108,11 @@ def test_a_payload_is_learnt_on_top_of_the_certified_arm_in_a_second(whole):
     assert names(fitted) == ["PAYLOAD", "ADAPT", "CERTIFY", "MONITOR"]
     begin, armed = first_in(fitted, SchemeState.ADAPT), first_in(fitted, SchemeState.MONITOR)
     assert (armed - begin) * PERIOD_S <= 1.0
-    np.testing.assert_array_equal(fitted[begin + 1].theta_hat, pushed[-1].theta_hat)
-    np.testing.assert_allclose(fitted[-1].theta_hat[:3] - pushed[-1].theta_hat[:3], PAYLOAD_1KG[:3], atol=0.02)
+    np.testing.assert_array_equal(theta_of(fitted[begin + 1]), theta_of(pushed[-1]))
+    np.testing.assert_allclose(theta_of(fitted[-1])[:3] - theta_of(pushed[-1])[:3], PAYLOAD_1KG[:3], atol=0.02)
     for output in fitted[:-1]:
         np.testing.assert_array_equal(output.theta_ff, pushed[-1].theta_ff)
-    np.testing.assert_array_equal(fitted[-1].theta_ff, fitted[-1].theta_hat)
+    np.testing.assert_array_equal(fitted[-1].theta_ff, theta_of(fitted[-1]))
 
 
 def test_a_touch_while_it_learns_is_reported_and_the_arm_is_learnt_anew_from_nothing(whole, interrupted):
@@ -120,11 +124,11 @@ def test_a_touch_while_it_learns_is_reported_and_the_arm_is_learnt_anew_from_not
     assert (reports[0].is_final, reports[-1].is_final) == (False, True)
     assert (reports[-1].link, reports[-1].direction[0]) == (1, 1)
     again = interrupted[touched + first_in(interrupted[touched:], SchemeState.ADAPT) + 1]
-    theta = np.concatenate([again.theta_hat, again.block[PLACES["theta_further"]]])
+    theta = np.concatenate([theta_of(again), again.block[PLACES["theta_further"]]])
     np.testing.assert_array_equal(theta, PRIOR)
-    assert np.max(np.abs(interrupted[touched].theta_hat)) > 0.01
+    assert np.max(np.abs(theta_of(interrupted[touched]))) > 0.01
     assert again.block[PLACES["excitation"]] == 0.0
-    np.testing.assert_allclose(interrupted[-1].theta_hat[:3], whole[0][-1].theta_hat[:3], atol=0.01)
+    np.testing.assert_allclose(theta_of(interrupted[-1])[:3], theta_of(whole[0][-1])[:3], atol=0.01)
     assert not any(output.is_model_valid for output in interrupted[:armed])
     assert interrupted[armed].is_model_valid
 
@@ -133,7 +137,7 @@ def test_a_model_that_fails_its_test_is_learnt_anew_from_nothing():
     loop = ExcitedLoop(replace(SETTINGS, certified=replace(SETTINGS.certified, beta_Nm=0.001)))
     outputs = loop.run_until(SchemeState.CERTIFY) + loop.run_until(SchemeState.ADAPT) + loop.run(1)
     assert names(outputs)[2:] == ["ADAPT", "CERTIFY", "ADAPT"]
-    np.testing.assert_array_equal(outputs[-1].theta_hat, PRIOR[:7])
+    np.testing.assert_array_equal(theta_of(outputs[-1]), PRIOR[:7])
     assert not outputs[-1].is_model_valid
 
 

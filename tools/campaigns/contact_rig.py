@@ -164,7 +164,7 @@ class Rig:
         decision, state = self._decision[0], self._supervised
         output = SchemeOutput(
             self._cycle, state, previous, FaultReason(decision["fault"]), int(decision["contact_joints"]), True,
-            self._theta, self._theta, tau_ext_hat, contact, self._values.copy(), Reaction(decision["reaction"]),
+            self._theta, tau_ext_hat, contact, self._values.copy(), Reaction(decision["reaction"]),
         )  # fmt: skip
         self._reference.step(arm, output)
         if self._reference.is_floating:

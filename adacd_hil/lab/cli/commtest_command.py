@@ -222,10 +222,9 @@ def describe(test: CommunicationTest, settings: Settings, scheduler: str) -> dic
         "bins_us": {
             quantity.name: [
                 {"below": None if bound == float("inf") else bound, "count": count}
-                for bound, count in doubling_bins(values_us, _FIRST_BIN_US, _BINS)
+                for bound, count in doubling_bins(test.columns.times_us(quantity), _FIRST_BIN_US, _BINS)
             ]
             for quantity in QUANTITIES
-            if (values_us := test.columns.times_us(quantity)) is not None
         },
     }
 

@@ -9,7 +9,6 @@ The size of a report is bounded, whatever the length of the run. The tables as C
 """
 
 import hashlib
-import math
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from functools import cache
@@ -21,8 +20,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from adacd_hil.lab.score.metrics import Beside, Metrics, ReportedContact
 from adacd_hil.lab.score.report_wording import number_text
 from adacd_hil.lab.score.run_arrays import StretchOfRun
-from adacd_hil.lab.score.verdict import BETA, CAD_BY_SECTION, FILTERS, FROZEN_BY_SECTION, HOLD, SMALLEST_MARGIN
-from adacd_hil.score.wording import NONE
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.terminal import keep_units
 
 if TYPE_CHECKING:
@@ -188,51 +186,8 @@ def shown_beside(metrics: Metrics) -> Beside | None:
     return metrics.evidence.paper_beside if metrics.evidence is not None and has_paper(metrics) else None
 
 
-def paper_head(metrics: Metrics) -> tuple[str, ...]:
-    """Return the head of the table of `paper_cells`; with columns of the paper if its experiment was played."""
-    if metrics.evidence is None:
-        return ("", "paper", "measured") if has_paper(metrics) else ("", "measured")
-    paper = ("paper (printed)", "paper's scheme, same stream") if has_paper(metrics) else ()
-    return ("", *paper, "certified")
-
-
-_PLAIN_NAMES: Final = {
-    FROZEN_BY_SECTION[0]: "Largest unexplained torque, first detection section",
-    FROZEN_BY_SECTION[1]: "Largest unexplained torque, second detection section",
-    CAD_BY_SECTION[0]: "The same with the CAD model, first detection section",
-    CAD_BY_SECTION[1]: "The same with the CAD model, second detection section",
-    BETA: "Residual that learning must come below",
-    HOLD: "How long it must stay there, or was tested",
-    FILTERS: "Filter of the residual",
-    SMALLEST_MARGIN: "Smallest margin: threshold over unexplained torque",
-}
-"""Names of quantities for readers who do not know the paper; report.json keeps the paper's."""
-
-
-def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
-    """Return a row of texts per quantity: name, the paper's value, its scheme's on the same stream, the measured one.
-
-    Columns as in `paper_head`: the two of the paper only if its experiment was played, the second of them only for a
-    certified run. Quantities without any value are left out.
-    """
-    rows = []
-    for row in metrics.paper:
-        if row.paper is None and row.measured == NONE:
-            continue
-        beside = () if metrics.evidence is None or row.paper is None else (row.beside or NONE,)
-        quantity = row.quantity if row.paper is not None else _PLAIN_NAMES.get(row.quantity, row.quantity)
-        rows.append((quantity, *(() if row.paper is None else (row.paper,)), *beside, row.measured))
-    return rows
-
-
 def stretch_text(stretch: StretchOfRun) -> str:
     """Return a phrase on the time window of a log that was read; if it is wider than requested, the phrase says why."""
-    start_s, end_s = stretch.found
-    text = (
-        "the log"
-        + ("" if math.isinf(start_s) else f" from {start_s:.2f} s")
-        + ("" if math.isinf(end_s) else f" until {end_s:.2f} s")
-    )
-    if stretch.found == stretch.asked:
-        return text
-    return f"{text}, widened so that no contact and no adaptation is cut"
+    found = TimeWindow(*(round(bound_s, 2) for bound_s in stretch.found))
+    is_wider = stretch.found != stretch.asked
+    return f"the log {found.text}{', widened so that no contact and no adaptation is cut' if is_wider else ''}"

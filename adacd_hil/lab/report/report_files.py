@@ -21,11 +21,10 @@ from adacd_hil.lab.report.page import has_paper, went_wrong
 from adacd_hil.lab.report.report_json import JSON_NAME, report_json
 from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.report.run_reading import read_run
-from adacd_hil.lab.report.timeline import stays_of
 from adacd_hil.lab.score.evaluation import RunGatherer, evaluate
 from adacd_hil.lab.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.lab.score.report_wording import number_text
-from adacd_hil.lab.score.run_arrays import Run, section_at
+from adacd_hil.lab.score.run_arrays import Run, section_at, stays_of
 from adacd_hil.lab.score.verdict import headlines, is_good
 from adacd_hil.log.log_files import failing_as
 from adacd_hil.log.logged_run import Progress
@@ -124,10 +123,10 @@ def _placed(step: NextStep) -> NextStep:
     return step._replace(text=f"{step.text} In the folder of {' and '.join(missing)}:") if missing else step
 
 
-def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: RunGatherer | None = None) -> Report:
+def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: RunGatherer) -> Report:
     """Write the report of a run that is in memory into `out_dir`, over an earlier one; return it.
 
-    gathered: the sums over all cycles; None: the run has all of its cycles. Raises LogError if it can't be written.
+    gathered: the sums over all cycles. Raises LogError if it can't be written.
     """
     metrics = evaluate(run, gathered)
     shown_run = run if has_paper(metrics) else dataclasses.replace(run, beside=None)

@@ -53,7 +53,7 @@ def report_json(
                 "frames": metrics.frames,
                 "dropped": metrics.dropped,
                 "is_complete": source.is_complete,
-                "problem": source.problem,
+                "problem": source.notice,
             },
             "stretch": None if stretch is None else _stretch_json(stretch),
             "paper": metrics.paper,

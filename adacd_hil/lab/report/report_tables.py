@@ -1,7 +1,7 @@
 """The tables of a report's page, those of the timing evidence included, those of contacts not."""
 
 from collections.abc import Mapping, Sequence
-from itertools import islice
+from itertools import compress, islice
 from string import ascii_letters
 from typing import Final
 
@@ -11,9 +11,8 @@ from adacd_hil.lab.report.page import (
     SECTIONS,
     Cell,
     Table,
+    has_paper,
     make_table,
-    paper_cells,
-    paper_head,
     stretch_text,
 )
 from adacd_hil.lab.score.evaluation import OLDEST_CYCLES
@@ -28,18 +27,46 @@ from adacd_hil.lab.score.metrics import (
 )
 from adacd_hil.lab.score.report_wording import number_text, pair_text, percent_text, rate_sentence, signed_text
 from adacd_hil.lab.score.run_arrays import QUANTITIES, Quantity, Run
+from adacd_hil.lab.score.verdict import BETA, CAD_BY_SECTION, FILTERS, FROZEN_BY_SECTION, HOLD, SMALLEST_MARGIN
 from adacd_hil.printable import number_of
 from adacd_hil.records import PARAMETER_UNITS
 from adacd_hil.score.distribution import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES
 from adacd_hil.score.smallest_push import PUSH_WITHIN
 from adacd_hil.score.wording import NONE
 
+_PLAIN_NAMES: Final = {
+    FROZEN_BY_SECTION[0]: "Largest unexplained torque, first detection section",
+    FROZEN_BY_SECTION[1]: "Largest unexplained torque, second detection section",
+    CAD_BY_SECTION[0]: "The same with the CAD model, first detection section",
+    CAD_BY_SECTION[1]: "The same with the CAD model, second detection section",
+    BETA: "Residual that learning must come below",
+    HOLD: "How long it must stay there, or was tested",
+    FILTERS: "Filter of the residual",
+    SMALLEST_MARGIN: "Smallest margin: threshold over unexplained torque",
+}
+"""Names of quantities for readers who do not know the paper; report.json keeps the paper's."""
+
 
 def paper_table(metrics: Metrics) -> Table:
-    """Return the table of `paper_cells`: the paper's figures, if any, beside the measured ones."""
-    rows = [[*cells[:-1], Cell(cells[-1], "strong")] for cells in paper_cells(metrics)]
-    head = paper_head(metrics)
-    return make_table(head, rows, left=range(len(head)))
+    """Return the table of measured quantities; quantities without any value are left out.
+
+    If the paper's experiment was played, the paper's values stand beside them and, for a certified run, those of its
+    scheme on the same stream.
+    """
+    is_paper, is_certified = has_paper(metrics), metrics.evidence is not None
+    columns = (True, is_paper, is_paper and is_certified, True)
+    head = ("", "paper (printed)", "paper's scheme, same stream", "certified")
+    if not is_certified:
+        head = ("", "paper", "", "measured")
+    names = {} if is_paper else _PLAIN_NAMES
+    rows = [
+        (names.get(row.quantity, row.quantity), row.paper, row.beside, Cell(row.measured, "strong"))
+        for row in metrics.paper
+        if is_paper or row.measured != NONE
+    ]
+    return make_table(
+        list(compress(head, columns)), [list(compress(row, columns)) for row in rows], left=range(len(head))
+    )
 
 
 def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
@@ -213,7 +240,6 @@ def origin_table(metrics: Metrics, run: Run, source: ReportSource) -> Table:
     return make_table(("", ""), rows, left=(0, 1))
 
 
-_ABSENT: Final = "not in this log"
 _COUNTS: Final = {
     "overruns": "periods skipped (overruns)",
     "frames_missing": "cyclic frames missing or refused",
@@ -266,8 +292,7 @@ def _time_row(quantity: Quantity, evidence: TimingEvidence, names: Sequence[str]
     label = (quantity.title, quantity.meaning)
     statistics = evidence.times[quantity.name]
     if statistics is None:
-        reason = NONE if evidence.is_modelled and quantity.name == "lateness" else _ABSENT
-        return (label, *[""] * (len(names) - 1), reason)
+        return (label, *[""] * (len(names) - 1), NONE)
     cells: list[object] = [*_values(statistics, names)]
     if quantity.is_reserve and statistics.get("min", 0.0) < 0.0:
         cells[-1] = Cell(cells[-1], "bad")
@@ -282,9 +307,6 @@ def _counts_table(evidence: TimingEvidence) -> Table:
     rows: list[Sequence[object]] = []
     for name, words in _COUNTS.items():
         count = evidence.counts[name]
-        if count is None:
-            rows.append((words, "", _ABSENT))
-            continue
         rows.append((words, Cell(count.total, "bad" if count.total else ""), number_text(count.per_100000, 1)))
     return make_table((f"in {evidence.cycles} cycles", "count", "per 100 000"), rows)
 
@@ -293,18 +315,15 @@ def _queues_table(evidence: TimingEvidence) -> Table:
     rows: list[Sequence[object]] = []
     names = PERCENTILE_NAMES[1], PERCENTILE_NAMES[-1]
     for name, words in _QUEUES.items():
-        depth = evidence.queues_bytes[name]
-        values = ["", _ABSENT] if depth is None else [number_text(depth.get(key), 0) for key in names]
-        rows.append((words, *values))
+        depth = evidence.queues_bytes[name] or {}
+        rows.append((words, *(number_text(depth.get(key), 0) for key in names)))
     return make_table(("bytes", *names), rows)
 
 
 def _ages_table(evidence: TimingEvidence) -> Table:
-    ages = evidence.data_age
-    head = ("age of the oldest value used", "cycles", "share")
-    if ages is None:
-        return make_table(head, [("", "", _ABSENT)])
-    labels = [f"{age}" if age < OLDEST_CYCLES else f"{age} or more" for age in range(len(ages))]
-    shares = zip(labels, ages, strict=True)
-    rows = [(label, str(count), f"{100.0 * count / evidence.cycles:.3f} %") for label, count in shares if count]
-    return make_table(head, rows)
+    rows = [
+        (f"{age}" if age < OLDEST_CYCLES else f"{age} or more", str(count), f"{100.0 * count / evidence.cycles:.3f} %")
+        for age, count in enumerate(evidence.data_age)
+        if count
+    ]
+    return make_table(("age of the oldest value used", "cycles", "share"), rows)

@@ -162,7 +162,7 @@ def contacts_table(metrics: Metrics) -> Table | None:
     if not metrics.contacts:
         return None
     beside = shown_beside(metrics)
-    theirs = {} if beside is None else {each["number"]: each for each in beside.contacts}
+    theirs = {} if beside is None else {each.number: each for each in beside.contacts}
     rows: list[list[object]] = []
     for contact in shown_contacts(metrics, CONTACTS):
         is_found = contact.detected_s is not None
@@ -186,7 +186,7 @@ def contacts_table(metrics: Metrics) -> Table | None:
         ]
         if theirs:
             their = theirs[contact.number]
-            row.append(number_text(their["delay_ms"], 0) if their["is_armed"] else "not armed")
+            row.append(number_text(their.delay_ms, 0) if their.is_armed else "not armed")
         rows.append(row)
     return make_table((*_CONTACT_HEAD, *["paper's scheme ms"][: len(theirs)]), rows, left=())
 
@@ -195,7 +195,7 @@ def contact_cards(metrics: Metrics, run: Run) -> list[dict[str, Any]]:
     """Return the cards of the first CARDS contacts: report with uncertainty, truth, and drawing of the arm.
 
     Keys: number; link: the reported one, else the true one; at_s; is_wrong; kind: words; entries: (name, text); arm:
-    drawing or None; stretch_s: from and to which time, s since motion start, the traces of a card show.
+    drawing; stretch_s: from and to which time, s since motion start, the traces of a card show.
     """
     contacts = metrics.contacts[:CARDS]
     strongest_N = max((abs(contact.force_N) for contact in contacts if contact.force_N is not None), default=0.0)
@@ -287,13 +287,8 @@ def _torques(contact: ReportedContact) -> list[tuple[str, str]]:
     return entries
 
 
-def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> dict[str, Any] | None:
-    """Return a drawing of the arm when a contact was found, or, if it was missed, when it began.
-
-    None without measured positions.
-    """
-    if run.motion is None:
-        return None
+def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> dict[str, Any]:
+    """Return a drawing of the arm when a contact was found, or, if it was missed, when it began."""
     at_s = contact.at_s if contact.detected_s is None else contact.detected_s
     q: Vector = run.motion.q[row_at(run, at_s)]
     push = _push(contact, strongest_N, run.settings.arm.link_length_m[0])

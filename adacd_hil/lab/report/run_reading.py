@@ -51,12 +51,13 @@ from adacd_hil.lab.score.run_arrays import (
     is_realtime,
     last_cycle,
     split_sections,
+    stays_of,
     truth_rows,
 )
 from adacd_hil.lab.score.run_judge import find_detections, timed_contacts, uncovered_watch
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, DBC_NAME, ENDING_KEY, TRUTH_NAME, LogError
 from adacd_hil.log.log_parts import CUT, PLANNED_ENDINGS, whole_number
-from adacd_hil.log.logged_run import Cycles, Mask, Milestones, Progress, host_cycles, settings_of
+from adacd_hil.log.logged_run import Cycles, Milestones, Progress, host_cycles, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series, contacts_of, start_of_log
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, FRAME_CHECKS, SCHEME
@@ -163,6 +164,8 @@ def _shell(stream: LogStream, truth: TruthTable | None) -> Run:
         metadata=metadata,
         frames=None,
         dropped=None,
+        contact_joints=np.empty(0, np.uint8),
+        motion=MeasuredMotion(nothing, nothing, nothing),
         log_start_ns=start_of_log(stream.path),
     )
 
@@ -277,7 +280,7 @@ class RunReading:
         self._events: list[LoggedEvent] = []
         self._checks: list[CheckCounts] = []
         self._finish_cycle: int | None = None  # of the first request to finish
-        self._zero_ns = shell.motion_start_ns
+        self._zero_ns = None if shell.stretch is None else shell.zero_ns
         self._first_ns: int | None = None
         self._last_cycle = -1
 
@@ -382,7 +385,7 @@ class RunReading:
             events=tuple(self._events),
             finish_cycle=self._finish_cycle,
             checks=_joined(self._checks),
-            motion_start_ns=zero_ns,
+            zero_ns=zero_ns,
         )
         if self._truth is None or self._clock is None:
             return run
@@ -392,7 +395,7 @@ class RunReading:
     def _settle(self, end: int) -> None:
         """Add the kept rows before `end` to `sums`, each once. Of a long run, drop then those that are not drawn."""
         outline = self.outline()
-        shell = replace(self._shell, truth=None, motion_start_ns=outline.motion_start_ns)
+        shell = replace(self._shell, truth=None, zero_ns=outline.zero_ns)
         self.sums.untouched.add_untouched(self._rows.run(shell, slice(self._settled, end)), outline)
         first, cycles = self._settled, self._rows.cycles
         self._settled = end
@@ -414,8 +417,7 @@ class RunReading:
     def _time_curves(self, rows: slice) -> Iterator[NDArray[np.float64]]:
         """Yield the cycles' times, queues and skipped periods in these rows, a curve (n,) each."""
         for name in (*(quantity.column for quantity in QUANTITIES), *QUEUES.values(), "overruns"):
-            if name in self._times.names:
-                yield self._times.column(name)[rows].astype(np.float64)
+            yield self._times.column(name)[rows].astype(np.float64)
 
     def _curves(self, shell: Run, rows: slice) -> Iterator[NDArray[np.float64]]:
         """Yield the curves (n,) that the report draws over /scheme, in these of the kept rows; shell: as of `run`."""
@@ -442,7 +444,7 @@ def _around(run: Run) -> list[Bounds]:
     These are `AROUND_S` around the first `TRACED_CONTACTS` contacts and as many detections, and the first
     `ADAPTATION_S` of the first `ADAPTATIONS` adaptations.
     """
-    onsets_s = [float(each.time_s[0]) for each in timed_contacts(run) if each.time_s is not None]
+    onsets_s = [float(each.time_s[0]) for each in timed_contacts(run)]
     found_s = [(detection.t_ns - run.zero_ns) * 1e-9 for detection in find_detections(run)]
     around = [
         (at_s - AROUND_S[0], at_s + AROUND_S[1]) for at_s in (*onsets_s[:TRACED_CONTACTS], *found_s[:TRACED_CONTACTS])
@@ -476,7 +478,6 @@ class TruthClock:
     """Finds the host's time, `t_ns`, of each row of the truth, as the log is read: interpolated between its cycles."""
 
     def __init__(self, truth: TruthTable) -> None:
-        assert truth.rows.attempt is not None
         self._cycle, self._attempt = truth.rows.cycle, truth.rows.attempt
         self.t_ns = np.zeros(len(self._cycle), np.int64)
         self._pending = np.arange(len(self._cycle))
@@ -632,40 +633,33 @@ def _widened(run: Run, shell: Run, stretch: TimeWindow, start_ns: int) -> tuple[
     has motion start, truth and stretch.
     """
     zero_ns = run.zero_ns
+    motion_start_s = (zero_ns - start_ns) * 1e-9
     first_s, last_s = ((bound_ns - zero_ns) * 1e-9 for bound_ns in stretch.bounds_ns(start_ns))
-    busy = sorted(_busy(run))
+    found, busy = stretch, sorted(_busy(run))
     for begin_s, end_s in reversed(busy):
         if begin_s < first_s < end_s:
-            first_s = begin_s
+            first_s, found = begin_s, found._replace(start_s=motion_start_s + begin_s)
     for begin_s, end_s in busy:
         if begin_s < last_s < end_s:
-            last_s = end_s
-    bounds_ns = (round(first_s * 1e9) + zero_ns, round(last_s * 1e9) + zero_ns)
-    begun_s = [float(each.time_s[0]) for each in timed_contacts(run) if each.time_s is not None]
+            last_s, found = end_s, found._replace(end_s=motion_start_s + end_s)
+    begun_s = [float(each.time_s[0]) for each in timed_contacts(run)]
     if run.truth is None:
         begun_s = [(detection.t_ns - zero_ns) * 1e-9 for detection in find_detections(run)]
-    known = StretchOfRun(
-        stretch,
-        TimeWindow(*((bound_ns - start_ns) * 1e-9 for bound_ns in bounds_ns)),
-        sum(at_s < first_s for at_s in begun_s),
-        (zero_ns - start_ns) * 1e-9,
-    )
+    known = StretchOfRun(stretch, found, sum(at_s < first_s for at_s in begun_s), motion_start_s)
     truth = run.truth
-    if truth is not None and truth.time_s is not None:
+    if truth is not None:
         truth = truth_rows(truth, (truth.time_s >= first_s) & (truth.time_s < last_s))
-    return replace(shell, motion_start_ns=zero_ns, truth=truth, stretch=known), bounds_ns
+    return replace(shell, zero_ns=zero_ns, truth=truth, stretch=known), found.bounds_ns(start_ns)
 
 
 def _busy(run: Run) -> Iterator[tuple[float, float]]:
-    """Yield start and end, s since motion start, of each true contact and each time in a state of `BUSY`.
+    """Yield start and end, s since motion start, of each true contact and each stay in a state of `BUSY`.
 
     A margin before and the settling time after are included.
     """
-    time_s, later_s = run.time_s(), SETTLING_TIME_CONSTANTS / run.a_rad_s
-    is_busy: Mask = np.concatenate(([False], np.isin(run.state, BUSY), [False]))
-    edges = np.flatnonzero(is_busy[1:] != is_busy[:-1])
-    for first, end in edges.reshape(-1, 2).tolist():
-        yield float(time_s[first]) - MARGIN_S, float(time_s[min(end, len(time_s) - 1)]) + later_s
+    later_s = SETTLING_TIME_CONSTANTS / run.a_rad_s
+    for stay in stays_of(run):
+        if stay.state in BUSY:
+            yield stay.start_s - MARGIN_S, stay.end_s + later_s
     for contact in timed_contacts(run):
-        assert contact.time_s is not None
         yield float(contact.time_s[0]) - MARGIN_S, float(contact.time_s[-1]) + later_s

@@ -14,7 +14,7 @@ from adacd_hil.lab.report.page import MARKS
 from adacd_hil.lab.report.traces import Traces, pack_tracks, run_tracks
 from adacd_hil.lab.score.metrics import Metrics, ReportedContact
 from adacd_hil.lab.score.report_wording import STATE_WORDS, number_text
-from adacd_hil.lab.score.run_arrays import Run
+from adacd_hil.lab.score.run_arrays import Run, Stay, stays_of
 from adacd_hil.records import SchemeState
 
 STATE_COLOURS: Final = {
@@ -37,14 +37,6 @@ _DIGIT: Final = 8.0
 """Width of a digit of a number, and room beside it."""
 _TICKS: Final = 12
 _MOST_NOTICES: Final = 300
-
-
-class Stay(NamedTuple):
-    """A span of time in one state, s since motion start."""
-
-    state: SchemeState
-    start_s: float
-    end_s: float
 
 
 class Notice(NamedTuple):
@@ -71,23 +63,6 @@ class Mark(NamedTuple):
     width: float
     look: str
     label: str = ""
-
-
-def stays_of(run: Run) -> list[Stay]:
-    """Return the spans of a run in one state each, in order of time; [] for a run without cycles.
-
-    A span ends at the first cycle of the next one, the last span at the last cycle.
-    """
-    if run.state.size == 0:
-        return []
-    edges = np.flatnonzero(run.state[1:] != run.state[:-1]) + 1
-    starts = np.concatenate(([0], edges))
-    time_s = run.time_s()
-    ends_s = [*time_s[edges].tolist(), float(time_s[-1])]
-    return [
-        Stay(SchemeState(int(run.state[row])), float(time_s[row]), end_s)
-        for row, end_s in zip(starts, ends_s, strict=True)
-    ]
 
 
 def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
@@ -187,7 +162,7 @@ def _rank(stay: Stay) -> int:
 
 def _state_marks(stays: list[Stay], scale: _Scale) -> Iterator[Mark]:
     for drawn in _drawn_stays(stays, scale):
-        stay = Stay(max(drawn, key=_rank).state, drawn[0].start_s, drawn[-1].end_s)
+        stay = drawn[0]._replace(state=max(drawn, key=_rank).state, end_s=drawn[-1].end_s)
         left, right = _x(scale, stay.start_s), _x(scale, stay.end_s)
         name, width = STATE_WORDS[stay.state], max(right - left, _NARROWEST)
         label = name if width > _LETTER * len(name) + 8 else ""

@@ -94,8 +94,6 @@ def panels_of(run: Run) -> tuple[TracePanel, ...]:
 
 
 def _motion(run: Run) -> Iterator[TracePanel]:
-    if run.motion is None:
-        return
     for name, title, unit in (
         ("q", "Measured position q", "rad"),
         ("dq", "Measured velocity dq", "rad/s"),
@@ -219,29 +217,28 @@ _TIMES: Final = ((LATENESS, "identified"), (COMPUTE, "joint1"), (SYNC_TO_COMMAND
 
 
 def timing_track(columns: CycleColumns, period_us: float, zero_ns: int, has_grid: bool) -> Track:
-    """Return a track of the times of `_TIMES`, queues and skipped periods, as far as logged, over s since `zero_ns`.
+    """Return a track of the times of `_TIMES`, queues and skipped periods, over s since `zero_ns`.
 
     Without a skipped period there is no panel of skipped periods. period_us: drawn as a level in the panels of times.
     has_grid: False in lockstep, where lateness and queues are left out.
     """
     panels = []
     for quantity, colour in _TIMES:
-        values_us = columns.times_us(quantity)
-        if values_us is not None and (has_grid or quantity is not LATENESS):
+        if has_grid or quantity is not LATENESS:
             title = f"{quantity.title}: {quantity.meaning}"
-            trace = Trace(quantity.title, values_us, FINEST["µs"], colour)
+            trace = Trace(quantity.title, columns.times_us(quantity), FINEST["µs"], colour)
             panels.append(TracePanel(f"time-{quantity.name}", title, "µs", (trace,), levels=(period_us,)))
-    queues = [name for name, column in QUEUES.items() if has_grid and column in columns]
-    if queues:
+    if has_grid:
         traces = (
-            Trace(name, columns[QUEUES[name]].astype(np.float64), FINEST["bytes"], f"queue_{name}") for name in queues
+            Trace(name, columns[column].astype(np.float64), FINEST["bytes"], f"queue_{name}")
+            for name, column in QUEUES.items()
         )
         title = "Queues: of the bus, to be received and to be sent, and to the log's writer"
         panels.append(TracePanel("queues", title, "bytes", tuple(traces)))
-    if "overruns" in columns and columns["overruns"].any():
+    if columns["overruns"].any():
         skipped = Trace("skipped", columns.steps("overruns").astype(np.float64), FINEST["periods"], "alarm")
         panels.append(TracePanel("skipped", "Periods that were skipped", "periods", (skipped,)))
-    is_next = np.diff(columns["cycle"], prepend=-2) == 1 if "cycle" in columns else None
+    is_next = np.diff(columns["cycle"], prepend=-2) == 1
     at_s = np.asarray((columns.t_ns - zero_ns) * 1e-9, np.float64)
     return Track("timing", at_s, tuple(panels), is_next)
 

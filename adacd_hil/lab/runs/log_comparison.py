@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.lab.score.run_arrays import last_cycle
+from adacd_hil.lab.score.run_arrays import columns_of_series, last_cycle
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Milestones, Progress, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log, each_once, report_values
@@ -77,7 +77,7 @@ class RunReader:
     def __iter__(self) -> Iterator[NDArray[Any]]:
         """Yield the records of /scheme, piece by piece, and gather states, parameters, contacts and times.
 
-        Raises LogError if the log can't be read, or as `last_cycle`.
+        Raises LogError if the log can't be read, or as `last_cycle` and `columns_of_series`.
         """
         at = (-1, -1)
         for piece in self._stream:
@@ -99,10 +99,9 @@ class RunReader:
             times_s = ((contacts.t_ns - self.zero_ns) * 1e-9).tolist()
             reports = (ContactReport(**values) for values in report_values(contacts))  # enums stay numbers
             self._contacts = each_once((*self._contacts, *zip(times_s, reports, strict=True)))
-            cycles = self._wanted(piece.series[CYCLE.name])
+            cycles = columns_of_series(self._wanted(piece.series[CYCLE.name]))
             for name in _TIMES:
-                if name in cycles.fields:
-                    self._times[name].add_values(cycles.records[name] / 1e3)
+                self._times[name].add_values(cycles[name] / 1e3)
             yield records
         if not self.parameters and self.cycles:
             self._keep_parameters(last)
@@ -125,7 +124,7 @@ class RunReader:
     def timing_us(self) -> dict[str, dict[str, float]]:
         """Percentiles, µs, of the cycles' times read so far, by name ("lateness", …); of slack the low ones.
 
-        {} for a time that the log lacks.
+        {} for each without a cycle.
         """
         return {
             name.removesuffix("_ns"): times.low_percentiles() if name == "slack_ns" else times.percentiles()

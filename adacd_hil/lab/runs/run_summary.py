@@ -47,8 +47,8 @@ _IDENTITY: Final = re.compile(r"node \d+: (vendor \S+, product \S+), revision \S
 """The event of a device that was identified."""
 _MOTION_START: Final = "-> ADAPT"
 _TO_MONITOR: Final = ("ADAPT -> MONITOR", "CERTIFY -> MONITOR")
-_DAMAGES: Final = (LookupError, TypeError, ValueError, AttributeError)
-"""Errors that a damaged value of a report raises."""
+_DAMAGES: Final = (LookupError, TypeError, ValueError, AttributeError, RecursionError)
+"""Errors that a damaged report raises."""
 
 Pair = tuple[float, float]
 
@@ -178,7 +178,7 @@ def _figured(headed: RunSummary, info: LogInfo) -> RunSummary:
     except LogError as error:
         return _unjudged(headed, str(error))
     except _DAMAGES as error:
-        return _unjudged(headed, _damage(error))
+        return _unjudged(headed, f"{JSON_NAME} is damaged: {type(error).__name__} {error}")
 
 
 def judged(summary: RunSummary) -> RunSummary:
@@ -280,7 +280,8 @@ def _started(log: Path, start_ns: int = 0) -> tuple[datetime | None, str]:
 def _report_of(folder: Path, info: LogInfo) -> dict[str, Any] | None:
     """Return report.json of a run; None without one.
 
-    Raises LogError if it can't be read or is damaged, or is of a stretch, another log or another layout.
+    Raises LogError if it can't be read, or is of a stretch, another log or another layout, one of _DAMAGES if it is
+    damaged.
     """
     path = folder / JSON_NAME
     if not path.exists():
@@ -292,8 +293,6 @@ def _report_of(folder: Path, info: LogInfo) -> dict[str, Any] | None:
         is_own = counts == (info.cycles, info.frames) and info.metadata.items() <= said.items()
     except OSError as error:
         raise LogError(f"{JSON_NAME} can't be read: {error.strerror}") from None
-    except (*_DAMAGES, RecursionError) as error:
-        raise LogError(_damage(error)) from None
     if layout != SCHEMA:
         raise LogError(f"{JSON_NAME} has layout {layout}, {SCHEMA} is read")
     if stretch is not None:
@@ -303,22 +302,18 @@ def _report_of(folder: Path, info: LogInfo) -> dict[str, Any] | None:
     return table
 
 
-def _damage(error: BaseException) -> str:
-    return f"{JSON_NAME} is damaged: {type(error).__name__} {error}"
-
-
 def _unjudged(summary: RunSummary, problem: str) -> RunSummary:
     """Return the summary as NOT_JUDGED, with contacts and certificate by the log's events; BROKEN for a damaged log.
 
-    problem: why the report is not used, "" without a report; it begins the verdict of NOT_JUDGED. The first error, a
-    lack of cycles, and an ending that was not planned follow.
+    summary: BROKEN so far. problem: why the report is not used, "" without a report; it begins the verdict of
+    NOT_JUDGED. The first error, a lack of cycles, and an ending that was not planned follow.
     """
     try:
         info = read_info(summary.log)
     except LogError as error:
-        return dataclasses.replace(summary, status=BROKEN, verdict=one_line(error))
+        return dataclasses.replace(summary, verdict=one_line(error))
     if info.problems:
-        return dataclasses.replace(summary, status=BROKEN, verdict=one_line("; ".join(info.problems)))
+        return dataclasses.replace(summary, verdict=one_line("; ".join(info.problems)))
     said = [problem] if problem else []
     said += [f"error {info.faults[0]}"] if info.faults else []
     said += [] if info.cycles else ["no cycle was run"]
@@ -359,7 +354,6 @@ def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
     """
     log, certified = table["log"], table["certified"]
     is_good = _flag(table["is_clean"]) and _flag(log["is_complete"])
-    missing = f" The log is not whole: {_text(log['problem'])}" if log["problem"] else ""
     armed = [contact for contact in table["contacts"] if _flag(contact["is_armed"])]
     false_alarms = table["false_alarms"]
     has_truth = false_alarms is not None
@@ -368,7 +362,7 @@ def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
     return dataclasses.replace(
         summary,
         status=GOOD if is_good else NOT_GOOD,
-        verdict=one_line(_text(table["verdict"]) + missing),
+        verdict=one_line(table["verdict"] + " " + log["problem"]),
         certificate=_reported_certificate(summary, table),
         threshold_Nm=configured_Nm if certified is None else _threshold(table),
         margin=None if certified is None else _number(certified["smallest_margin"]),
@@ -400,7 +394,7 @@ def _sections(table: Mapping[str, Any], kind: str) -> list[Mapping[str, Any]]:
 
 def _first_adaptation(table: Mapping[str, Any]) -> str | None:
     """Return the label of the first complete adaptation in a report; None without one."""
-    return next((_text(each["label"]) for each in _sections(table, "adaptation") if _flag(each["is_complete"])), None)
+    return next((each["label"] for each in _sections(table, "adaptation") if _flag(each["is_complete"])), None)
 
 
 def _threshold(table: Mapping[str, Any]) -> Pair | None:
@@ -464,10 +458,4 @@ def _pair(values: Any) -> Pair:
 def _flag(value: Any) -> bool:
     if not isinstance(value, bool):
         raise TypeError(f"{value!r} is neither true nor false")
-    return value
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{value!r} is no text")
     return value

@@ -30,7 +30,6 @@ from adacd_hil.lab.score.run_arrays import (
     Quantity,
     Run,
     Section,
-    is_realtime,
     section_at,
     split_sections,
 )
@@ -40,7 +39,6 @@ from adacd_hil.lab.score.run_judge import (
     contacts_of,
     find_detections,
     ideal_response,
-    judge_run,
     row_at,
     step_delay_s,
 )
@@ -48,7 +46,7 @@ from adacd_hil.lab.score.verdict import compare_with_paper, list_findings
 from adacd_hil.log.logged_run import Cycles
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, SchemeState, Vector
 from adacd_hil.score.distribution import Distribution
-from adacd_hil.score.judge import Detection, Score, TrueContact
+from adacd_hil.score.judge import Detection, Score, TrueContact, judge
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.scheme_settings import KIND_S
 
@@ -76,18 +74,11 @@ class RunGatherer:
             self._state = int(state[-1])
 
 
-def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
-    """Return all metrics of a run.
-
-    gathered: the sums over all cycles; None: they are formed from the run, which must then have all of its cycles.
-    """
-    if gathered is None:
-        gathered = RunGatherer(run.settings, not is_realtime(run))
-        gathered.add_times(run.timing, run.cycle, run.state)
-        gathered.untouched.add_untouched(run, run)
+def evaluate(run: Run, gathered: RunGatherer) -> Metrics:
+    """Return all metrics of a run; gathered: the sums over all cycles."""
     timing, data = gathered.timing.evidence(), gathered.data.data(run)
     detections = find_detections(run)
-    score = judge_run(run, contacts_of(run), detections)
+    score = judge(contacts_of(run), detections)
     sections = split_sections(run)
     adaptation_s: dict[str, float | None] = {}
     parameters: dict[str, dict[str, tuple[float | None, float]]] = {}
@@ -220,12 +211,9 @@ def _contact(
 ) -> ReportedContact:
     """Return a true contact with its delays and peaks, and whether its detection named link and direction rightly.
 
-    The detection's reports are in it, too. detection: None: it was not detected. The run must have the truth, and the
-    contact its `time_s`.
+    The detection's reports are in it, too. detection: None: it was not detected. The run must have the truth.
     """
-    truth, time_s = run.truth, contact.time_s
-    assert truth is not None
-    assert time_s is not None
+    time_s = contact.time_s
     onset_s, touched = float(time_s[0]), slice(contact.rows)
     tau_ext, since_s = contact.tau_ext[touched], time_s[touched] - onset_s
     reported = _reported(run, detection)
@@ -259,7 +247,7 @@ def _contact(
         direction_ok=_is_direction_right(reported.get("direction"), until_final.sum(axis=0)),
         tau_ext_Nm=(float(peak[0]), float(peak[1])),
         torque_error_ratio=_torque_ratio(reported.get("tau_ext_peak_hat_Nm"), peak),
-        true_force_N=None if contact.force_N is None else float(contact.force_N[touched][is_seen].max()),
+        true_force_N=float(contact.force_N[touched][is_seen].max()),
         **reported,
     )
 
@@ -270,7 +258,7 @@ def _touches(run: Run, from_s: float, until_s: float) -> tuple[Vector, Cycles]:
     So a second person who touches the arm meanwhile is included.
     """
     assert run.truth is not None
-    time_s = run.truth_time_s()
+    time_s = run.truth.time_s
     rows = slice(np.searchsorted(time_s, from_s), np.searchsorted(time_s, until_s, side="right"))
     is_touched = run.truth.contact_index[rows] >= 0.0
     return run.truth.tau_ext[rows][is_touched], run.truth.contact_link[rows][is_touched].astype(np.int64)
@@ -325,44 +313,38 @@ class TimingGatherer:
         self._period_us = period_us
         self._is_modelled = is_modelled
         self._cycles = 0
-        self._times: dict[str, Distribution] = {}
-        self._histograms: dict[str, Cycles] = {}
-        self._depths: dict[str, Distribution] = {}
-        self._ages: Cycles | None = None
-        self._totals: dict[str, int] = {}
-        self._last: dict[str, int] = {}  # value of each running count
+        # Lockstep has no grid to be late on, and no queues.
+        quantities = [quantity for quantity in QUANTITIES if not (is_modelled and quantity is LATENESS)]
+        self._times = {quantity: Distribution() for quantity in quantities}
+        self._histograms = {quantity.name: log_counts(np.empty(0)) for quantity in quantities}
+        self._depths = {} if is_modelled else {name: Distribution() for name in QUEUES}
+        self._ages = np.zeros(OLDEST_CYCLES + 1, np.int64)
+        self._totals = dict.fromkeys((*_RUNNING, *_PER_CYCLE), 0)
+        self._last = dict.fromkeys(_RUNNING, 0)  # value of each running count
         self._reactions: Distribution | None = None
 
     def add_columns(self, columns: CycleColumns, reactions: NDArray[np.bool_] | None = None) -> None:
-        """Add times, queues, data ages and counts of the next cycles, of those columns that the log has.
+        """Add times, queues, data ages and counts of the next cycles.
 
         Call it in the order of the run: the last values of running counts are kept. If the times are modelled, lateness
         and queues are left out. reactions (n,): whether the state becomes REACT in a cycle; None without states.
         """
         self._cycles += len(columns)
-        for quantity in QUANTITIES:
-            self._add_times(quantity, columns)
-        for name, column in QUEUES.items():
-            if column in columns and not self._is_modelled:  # lockstep has no queues
-                self._depths.setdefault(name, Distribution()).add_values(columns[column])
-        if "data_age" in columns:
-            ages = np.bincount(np.minimum(columns["data_age"], OLDEST_CYCLES), minlength=OLDEST_CYCLES + 1)
-            self._ages = ages if self._ages is None else self._ages + ages
-        for name in (name for name in (*_RUNNING, *_PER_CYCLE) if name in columns):
-            added = columns.steps(name, self._last.get(name, 0)) if name in _RUNNING else columns[name]
-            self._totals[name] = self._totals.get(name, 0) + int(added.sum())
-            if len(columns):
-                self._last[name] = int(columns[name][-1])
-        if reactions is not None and (compute_us := columns.times_us(COMPUTE)) is not None:
+        for quantity, times in self._times.items():
+            values_us = columns.times_us(quantity)
+            times.add_values(values_us)
+            self._histograms[quantity.name] += log_counts(values_us)
+        for name, depths in self._depths.items():
+            depths.add_values(columns[QUEUES[name]])
+        self._ages += np.bincount(np.minimum(columns["data_age"], OLDEST_CYCLES), minlength=OLDEST_CYCLES + 1)
+        for name in self._totals:
+            added = columns.steps(name, self._last[name]) if name in _RUNNING else columns[name]
+            self._totals[name] += int(added.sum())
+        if len(columns):
+            self._last = {name: int(columns[name][-1]) for name in _RUNNING}
+        if reactions is not None:
             self._reactions = self._reactions or Distribution()
-            self._reactions.add_values(compute_us[reactions])
-
-    def _add_times(self, quantity: Quantity, columns: CycleColumns) -> None:
-        values_us = columns.times_us(quantity)
-        if values_us is None or (self._is_modelled and quantity is LATENESS):  # lockstep has no grid to be late on
-            return
-        self._times.setdefault(quantity.name, Distribution()).add_values(values_us)
-        self._histograms[quantity.name] = self._histograms.get(quantity.name, 0) + log_counts(values_us)
+            self._reactions.add_values(columns.times_us(COMPUTE)[reactions])
 
     def evidence(self) -> TimingEvidence:
         """Return the statistics of all cycles added so far: times, reactions, ages of data, queues, counts."""
@@ -374,21 +356,18 @@ class TimingGatherer:
             times={quantity.name: self._percentiles(quantity) for quantity in QUANTITIES},
             histograms={name: histogram_by_key(counts) for name, counts in self._histograms.items()},
             reaction=None if reactions is None else {"count": reactions.count, **reactions.percentiles()},
-            data_age=None if self._ages is None else tuple(self._ages.tolist()),
+            data_age=tuple(self._ages.tolist()),
             queues_bytes={name: self._depths[name].percentiles() if name in self._depths else None for name in QUEUES},
-            counts={name: self._count(name) for name in (*_RUNNING, *_PER_CYCLE)},
+            counts={name: self._count(total) for name, total in self._totals.items()},
         )
 
     def _percentiles(self, quantity: Quantity) -> Mapping[str, float] | None:
-        values = self._times.get(quantity.name)
+        values = self._times.get(quantity)
         if values is None:
             return None
         return values.low_percentiles() if quantity.is_reserve else values.percentiles()
 
-    def _count(self, name: str) -> Count | None:
-        if name not in self._totals:
-            return None
-        total = self._totals[name]
+    def _count(self, total: int) -> Count:
         return Count(total, total * PER_CYCLES / self._cycles if self._cycles else None)
 
 
@@ -404,15 +383,11 @@ def collect_evidence(columns: CycleColumns, period_us: float, is_modelled: bool)
 
 def find_reactions(
     columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8], before: int = SchemeState.INIT
-) -> NDArray[np.bool_] | None:
+) -> NDArray[np.bool_]:
     """Return for each cycle of `columns` (n,) whether the state becomes REACT in it.
-
-    None for a log that does not number its cycles.
 
     cycle, state: those of /scheme (k,). before: the state in the cycle before the first.
     """
-    if "cycle" not in columns:
-        return None
     is_reacting = state == SchemeState.REACT
     begins = is_reacting & ~np.concatenate(([before == SchemeState.REACT], is_reacting[:-1]))
     return np.isin(columns["cycle"], cycle[begins])

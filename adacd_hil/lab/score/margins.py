@@ -22,13 +22,14 @@ import numpy as np
 
 from adacd_hil.lab.score.metrics import (
     Beside,
+    BesideContact,
     CertifiedEvidence,
     ChannelMargin,
     ParameterEstimate,
     Residual,
     certificates_in,
 )
-from adacd_hil.lab.score.run_arrays import CertifiedStream, Run, Section, rows_of, split_sections
+from adacd_hil.lab.score.run_arrays import CertifiedStream, Run, Section, rows_of, split_sections, stays_of
 from adacd_hil.lab.score.run_judge import find_detections, placed_in, timed_contacts
 from adacd_hil.log.logged_run import Mask, is_armed_in
 from adacd_hil.records import JOINTS, SchemeState, Vector
@@ -72,9 +73,7 @@ class BesideGatherer:
         assert stream is not None
         armed = stream.is_armed & ~_parked(time_s, sections, end_s)
         over = armed & (np.abs(stream.tau_ext_hat) > stream.threshold).any(axis=1)
-        is_judged = np.ones(over.size, np.bool_)
-        if outline.truth is not None and outline.truth.span is not None:
-            is_judged = outline.truth.span.covers(piece.cycle)
+        is_judged = np.ones(over.size, np.bool_) if outline.truth is None else outline.truth.span.covers(piece.cycle)
         if outline.finish_cycle is not None:
             is_judged &= piece.cycle < outline.finish_cycle
         since_s = float(time_s[0]) - SETTLING_TIME_CONSTANTS / self._a_rad_s
@@ -106,7 +105,7 @@ class BesideGatherer:
         armed = run.beside.is_armed & ~_parked(time_s, sections, float(time_s[-1]) if time_s.size else 0.0)
         state = np.where(armed, np.uint8(SchemeState.MONITOR), np.uint8(SchemeState.ADAPT))
         threshold = np.full((len(time_s), JOINTS), np.nan)  # the configured one
-        contacts = (each for each in timed_contacts(run) if each.time_s is not None and each.time_s[-1] >= since_s)
+        contacts = (each for each in timed_contacts(run) if each.time_s[-1] >= since_s)
         return placed_in(run, contacts, state, threshold, self._a_rad_s)
 
     def beside(self, run: Run, sections: Sequence[Section]) -> Beside:
@@ -119,12 +118,12 @@ class BesideGatherer:
             adaptation_s={label: self._adaptation_s.get(label) for label in learnt},
             frozen_residual_max_Nm={label: _pair(self._largest.get(label)) for label in watched},
             contacts=tuple(
-                {
-                    "number": contact.number,
-                    "is_armed": contact.is_armed,
-                    "detected_s": None if contact.detected_ns is None else (contact.detected_ns - run.zero_ns) * 1e-9,
-                    "delay_ms": contact.delay_ms,
-                }
+                BesideContact(
+                    contact.number,
+                    contact.is_armed,
+                    None if contact.detected_ns is None else (contact.detected_ns - run.zero_ns) * 1e-9,
+                    contact.delay_ms,
+                )
                 for contact in score.contacts
             ),
             false_alarms=len(false_s) if has_truth else None,
@@ -162,19 +161,6 @@ def last_row(run: Run, section: Section) -> int:
     time_s = run.time_s()
     end = int(rows_of(time_s, section, float(time_s[-1])).stop)
     return end - 1 + int(section.is_complete)
-
-
-def _tests(run: Run, section: Section) -> list[float]:
-    """Return the length of each stay in CERTIFY within a section, s, in the order of time; [] without one.
-
-    A longer stay is cut at the section's end.
-    """
-    time_s = run.time_s()
-    rows = rows_of(time_s, section, float(time_s[-1]))
-    inside = np.concatenate(([False], run.state[rows] == SchemeState.CERTIFY, [False]))
-    edges = np.flatnonzero(inside[1:] != inside[:-1]) + rows.start
-    time_s = np.append(time_s, section.end_s)
-    return [float(time_s[end] - time_s[start]) for start, end in edges.reshape(-1, 2)]
 
 
 def _estimates(run: Run, stream: CertifiedStream, section: Section) -> dict[str, ParameterEstimate]:
@@ -282,10 +268,9 @@ class UntouchedGatherer:
             around = [(found.t_ns - settling_ns, found.t_ns + settling_ns) for found in find_detections(outline)]
         else:
             zero_ns = outline.zero_ns
-            spans_s = [contact.time_s[[0, -1]] for contact in timed_contacts(outline) if contact.time_s is not None]
+            spans_s = [contact.time_s[[0, -1]] for contact in timed_contacts(outline)]
             around = [(zero_ns + round(a * 1e9), zero_ns + round(b * 1e9) + settling_ns) for a, b in spans_s]
-            if truth.span is not None:
-                free &= truth.span.covers(piece.cycle)
+            free &= truth.span.covers(piece.cycle)
         for start_ns, end_ns in around:
             free[np.searchsorted(t_ns, start_ns) : np.searchsorted(t_ns, end_ns, side="right")] = False
         never = np.iinfo(np.int64).min // 2
@@ -357,10 +342,14 @@ def evaluate_certified(run: Run, sections: Sequence[Section], untouched: Untouch
     if stream is None:
         return None
     adaptations = [section for section in sections if section.kind == "adaptation"]
-    stays = {section.label: _tests(run, section) for section in adaptations}
+    tests = [stay for stay in stays_of(run) if stay.state is SchemeState.CERTIFY]
+    lengths_s = {
+        each.label: [stay.end_s - stay.start_s for stay in tests if each.start_s <= stay.start_s <= each.end_s]
+        for each in adaptations
+    }
     return CertifiedEvidence(
-        tests={label: len(lengths_s) for label, lengths_s in stays.items()},
-        test_s={label: lengths_s[-1] if lengths_s else None for label, lengths_s in stays.items()},
+        tests={label: len(found_s) for label, found_s in lengths_s.items()},
+        test_s={label: found_s[-1] if found_s else None for label, found_s in lengths_s.items()},
         estimates={section.label: _estimates(run, stream, section) for section in adaptations},
         margins=untouched.margins(sections),
         promotions=untouched.promotions,

@@ -46,13 +46,13 @@ class Count(NamedTuple):
 
 @dataclass(frozen=True)
 class TimingEvidence:
-    """The times of a run, summed up; None: not in the log, or without a meaning in lockstep.
+    """The times of a run, summed up; None: without a meaning in lockstep.
 
     is_modelled: lockstep, the times are those of the model of bus and host, not of this machine. times: percentiles by
-    name, µs, of each time; histograms: of the same, without those that the log lacks. reaction: percentiles of the
-    latency from the decision to the first command that reacts, µs, and the `count` of reactions. data_age: number of
-    cycles by the age, in cycles, of the oldest value used; the last entry is for OLDEST_CYCLES and more. queues_bytes,
-    counts: by name.
+    name, µs, of each time; histograms: of those that aren't None. reaction: percentiles of the latency from the
+    decision to the first command that reacts, µs, and the `count` of reactions; None without states. data_age: number
+    of cycles by the age, in cycles, of the oldest value used; the last entry is for OLDEST_CYCLES and more.
+    queues_bytes, counts: by name.
     """
 
     period_us: float
@@ -61,9 +61,9 @@ class TimingEvidence:
     times: Mapping[str, Mapping[str, float] | None]
     histograms: Mapping[str, Mapping[str, Any]]
     reaction: Mapping[str, float] | None
-    data_age: tuple[int, ...] | None
+    data_age: tuple[int, ...]
     queues_bytes: Mapping[str, Mapping[str, float] | None]
-    counts: Mapping[str, Count | None]
+    counts: Mapping[str, Count]
 
     def by_key(self) -> dict[str, Any]:
         """Return the evidence by the keys of report.json, such as "times_us"; a missing histogram is None."""
@@ -129,17 +129,29 @@ class CyclicData:
     excesses: tuple[str, ...]
 
 
+class BesideContact(NamedTuple):
+    """What the paper's scheme beside made of a true contact; number: as in the list of contacts.
+
+    detected_s: s since motion start; it and the delay are None if no crossing found the contact.
+    """
+
+    number: int
+    is_armed: bool
+    detected_s: float | None
+    delay_ms: float | None
+
+
 @dataclass(frozen=True)
 class Beside:
     """The results of the paper's scheme that ran beside, by the definitions of the module's first lines.
 
-    contacts: of each true contact `number`, as in the list of contacts, `is_armed`, `detected_s`, `delay_ms`. Without
-    the truth there are no contacts, and false alarms and misses are None. adaptation_s: None where it did not end.
+    Without the truth there are no contacts, and false alarms and misses are None. adaptation_s: None where it did not
+    end.
     """
 
     adaptation_s: dict[str, float | None]
     frozen_residual_max_Nm: dict[str, tuple[float, float] | None]
-    contacts: tuple[dict[str, Any], ...]
+    contacts: tuple[BesideContact, ...]
     false_alarms: int | None
     false_alarms_s: tuple[float, ...] | None
     missed: int | None
@@ -260,11 +272,6 @@ class ReportSource(NamedTuple):
     config: str = ""
     scenario: str = ""
     truth: str = ""
-
-    @property
-    def problem(self) -> str:
-        """Problems of log and truth in one line; "" without any."""
-        return "; ".join(filter(None, (self.log_problem, self.truth_problem)))
 
     @property
     def notice(self) -> str:

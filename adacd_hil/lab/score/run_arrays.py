@@ -66,7 +66,7 @@ QUANTITIES: Final = (
 
 @dataclass(frozen=True)
 class CycleColumns:
-    """The columns of /cycle over n cycles, int64 (n,). Columns that the log lacks are not in `columns`."""
+    """The columns of /cycle over n cycles, int64 (n,), by the names of `CycleRecord`."""
 
     t_ns: Cycles
     columns: Mapping[str, Cycles]
@@ -77,20 +77,15 @@ class CycleColumns:
     def __getitem__(self, name: str) -> Cycles:
         return self.columns[name]
 
-    def __contains__(self, name: str) -> bool:
-        return name in self.columns
-
     def rows(self, rows: Cycles) -> "CycleColumns":
         """Return the columns of some of the cycles; rows: their indices."""
         return CycleColumns(self.t_ns[rows], {name: column[rows] for name, column in self.columns.items()})
 
-    def times_us(self, quantity: Quantity) -> Vector | None:
-        """Return a time of the cycles that have it, µs (k,); None if the log lacks it.
+    def times_us(self, quantity: Quantity) -> Vector:
+        """Return a time of the cycles that have it, µs (k,).
 
         Cycles with missing frames have no time from SYNC to feedback.
         """
-        if quantity.column not in self:
-            return None
         values_ns = self[quantity.column]
         if quantity.column == "feedback_ns":
             values_ns = values_ns[self["frames_missing"] == 0]  # else it is when the host gave up
@@ -107,9 +102,11 @@ class CycleColumns:
 
 
 def columns_of_series(series: Series) -> CycleColumns:
-    """Return the columns of a log's /cycle; those that an older version lacks are left out."""
-    names = [name for name in CycleRecord._fields if name in series.fields]
-    return CycleColumns(series.t_ns, {name: series[name].astype(np.int64) for name in names})
+    """Return the columns of a log's /cycle. Raises LogError if its records lack one."""
+    lacking = [name for name in CycleRecord._fields if name not in series.fields]
+    if lacking:
+        raise LogError(f"{CYCLE.name} has no {', '.join(lacking)}")
+    return CycleColumns(series.t_ns, {name: series[name].astype(np.int64) for name in CycleRecord._fields})
 
 
 def columns_of_records(t_ns: Sequence[int], records: Sequence[CycleRecord]) -> CycleColumns:
@@ -211,7 +208,8 @@ class Run:
     """A run as plain arrays over n of its cycles: over all, or of a long one over those that the report keeps.
 
     Joint arrays are (n, 2), theta_hat (n, p). `truth` is None on a real arm. frames, dropped: counts of the log's
-    summary, None if it lacks them.
+    summary, None if it lacks them. zero_ns: motion start, the first cycle in ADAPT, else the first cycle; 0 without
+    cycles.
     """
 
     cycle: Cycles
@@ -229,13 +227,13 @@ class Run:
     metadata: Mapping[str, str]
     frames: int | None
     dropped: int | None
+    contact_joints: NDArray[np.uint8]  # bit i: joint i is over its threshold
+    motion: MeasuredMotion
+    zero_ns: int = 0
     finish_cycle: int | None = None  # cycle of the request to finish; None: never
-    contact_joints: NDArray[np.uint8] | None = None  # bit i: joint i is over its threshold
     certified: CertifiedStream | None = None  # None of the paper's scheme
     beside: PaperStream | None = None
-    motion: MeasuredMotion | None = None
     events: tuple[LoggedEvent, ...] = ()
-    motion_start_ns: int | None = None  # None: the first cycle in ADAPT, else the first cycle
     all_cycles: int | None = None  # of a long run: how many there are, of which the n are kept
     bucket: int = 1  # of a long run: of so many cycles those with extremes are kept
     log_start_ns: int | None = None  # the beginning of its log
@@ -270,39 +268,10 @@ class Run:
         is_certified = self.certified is not None
         return self.settings.certified.cutoffs_rad_s[0] if is_certified else self.settings.filter.a_rad_s
 
-    @property
-    def zero_ns(self) -> int:
-        """Motion start, ns of the run's clock: `motion_start_ns` if that is set, else the first cycle in ADAPT.
-
-        Without one it is the first cycle; 0 for a run without cycles.
-        """
-        if self.motion_start_ns is not None:
-            return self.motion_start_ns
-        if self.t_ns.size == 0:
-            return 0
-        adapting = self.state == SchemeState.ADAPT
-        return int(self.t_ns[int(np.argmax(adapting)) if adapting.any() else 0])
-
     def time_s(self) -> Vector:
         """Return the time of each cycle since motion start, s (n,)."""
         # Subtracted as integers: float64 resolves only 256 ns of an absolute time.
         return np.asarray((self.t_ns - self.zero_ns) * 1e-9, dtype=np.float64)
-
-    def time_of_s(self, cycle: NDArray[Any]) -> Vector:
-        """Return the time of any cycle numbers since motion start, s, interpolated between the run's cycles.
-
-        A number before the first or after the last cycle has the time of that cycle. Zeros for a run without cycles.
-        """
-        if self.cycle.size == 0:
-            return np.zeros(len(cycle))
-        return np.asarray(np.interp(cycle, self.cycle, self.time_s()), dtype=np.float64)
-
-    def truth_time_s(self) -> Vector:
-        """Return the time of each row of the truth since motion start, s (k,); empty without the truth."""
-        if self.truth is None:
-            return np.zeros(0)
-        time_s = self.truth.time_s
-        return self.time_of_s(self.truth.cycle) if time_s is None else time_s
 
 
 @dataclass(frozen=True)
@@ -344,6 +313,31 @@ def origins(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
     rows = np.arange(state.size)
     own = np.maximum.accumulate(np.where(is_interrupted(state), -1, rows))
     return np.where(own < 0, np.uint8(SchemeState.MONITOR), state[np.maximum(own, 0)])
+
+
+class Stay(NamedTuple):
+    """A span of time in one state, s since motion start. row: of its first cycle, in the arrays of the run."""
+
+    state: SchemeState
+    start_s: float
+    end_s: float
+    row: int
+
+
+def stays_of(run: Run) -> list[Stay]:
+    """Return the spans of a run in one state each, in order of time; [] for a run without cycles.
+
+    A span ends at the first cycle of the next one, the last span at the last cycle.
+    """
+    if run.state.size == 0:
+        return []
+    edges = np.flatnonzero(run.state[1:] != run.state[:-1]) + 1
+    time_s = run.time_s()
+    ends_s = [*time_s[edges].tolist(), float(time_s[-1])]
+    return [
+        Stay(SchemeState(int(run.state[row])), float(time_s[row]), end_s, row)
+        for row, end_s in zip([0, *edges.tolist()], ends_s, strict=True)
+    ]
 
 
 def split_sections(run: Run) -> tuple[Section, ...]:
@@ -402,18 +396,13 @@ def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> 
     Payloads and parameters after that cycle stay, those of later attempts don't.
     """
     rows = table.rows
-    if not rows.model_cycle.size:
+    if table.span is None:
         return None
     cycle = host_cycles(rows.cycle, rows.attempt, begins)
     of_host = (cycle <= last) & (rows.attempt < len(begins))
-    known = rows.model_attempt < len(begins)
     return replace(
-        truth_rows(replace(rows, cycle=cycle, time_s=time_s), of_host),
-        payload_kg=rows.payload_kg[known],
-        theta=rows.theta[known],
-        model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins)[known],
-        model_attempt=rows.model_attempt[known],
-        span=None if table.span is None else host_span(table.span, begins),
+        truth_rows(replace(rows.with_host_models(begins), cycle=cycle, time_s=time_s), of_host),
+        span=host_span(table.span, begins),
     )
 
 
@@ -423,8 +412,7 @@ def truth_rows(truth: Truth, rows: NDArray[np.bool_]) -> Truth:
     rows (m,): a mask.
     """
     names = ("cycle", "tau_ext", "contact_link", "contact_index", "force_N", "time_s", "attempt")
-    columns = {name: getattr(truth, name) for name in names}
-    return replace(truth, **{name: column[rows] for name, column in columns.items() if column is not None})
+    return replace(truth, **{name: getattr(truth, name)[rows] for name in names})
 
 
 def last_cycle(path: Path, scheme: Series, before: tuple[int, int] = (-1, -1)) -> tuple[int, int]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.lab.score.metrics import CyclicData, DeviceShares, Fault
 from adacd_hil.lab.score.report_wording import percent_text
-from adacd_hil.lab.score.run_arrays import CheckCounts, CycleColumns, Run
+from adacd_hil.lab.score.run_arrays import CheckCounts, CycleColumns, Run, stays_of
 from adacd_hil.log.logged_run import Cycles
 from adacd_hil.printable import one_line
 from adacd_hil.records import FaultReason, SchemeState
@@ -36,16 +36,12 @@ def find_faults(run: Run) -> tuple[Fault, ...]:
 
     The run must have the cycles in which the state changes.
     """
-    is_fault = run.state == SchemeState.FAULT
-    before = np.concatenate(([False], is_fault[:-1]))
-    time_s = run.time_s()
-    faults = []
-    for row in np.flatnonzero(is_fault & ~before).tolist():
-        is_last = bool(is_fault[row:].all())
-        faults.append(
-            Fault(FaultReason(int(run.fault[row])).name, float(time_s[row]), _cause(run, int(run.t_ns[row])), is_last)
-        )
-    return tuple(faults)
+    stays = stays_of(run)
+    return tuple(
+        Fault(FaultReason(int(run.fault[row])).name, start_s, _cause(run, int(run.t_ns[row])), row == stays[-1].row)
+        for state, start_s, _, row in stays
+        if state is SchemeState.FAULT
+    )
 
 
 def _cause(run: Run, t_ns: int) -> str:
@@ -110,24 +106,17 @@ class CyclicDataGatherer:
     def add_columns(self, columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
         """Count incomplete and aged data in the next cycles with powered drives, in the order of the run.
 
-        The second under way is kept for the next call. If columns don't number their cycles, only cycles are counted. A
-        kind of data that some columns lack is no longer counted, and unknown in the end. cycle, state: those of /scheme
-        (k,).
+        The second under way is kept for the next call. cycle, state: those of /scheme (k,).
         """
         is_powered = np.isin(state, _POWERED)
         self._cycles += int(np.count_nonzero(is_powered))
-        if "cycle" not in columns:
-            return
         powered = columns.rows(np.flatnonzero(np.isin(columns["cycle"], cycle[is_powered])))
         if not len(powered):
             return
         self._logged += len(powered)
-        for name in [name for name in self._counted if name not in powered]:
-            del self._counted[name]  # an older log does not have it
         for name in self._counted:
             self._counted[name] += int(np.count_nonzero(powered[name]))
-        if "frames_missing" in powered:
-            self._add_windows(np.array([powered["cycle"], powered["frames_missing"] > 0]))
+        self._add_windows(np.array([powered["cycle"], powered["frames_missing"] > 0]))
 
     def _add_windows(self, cycles: Cycles) -> None:
         """Store the worst share so far of incomplete cycles in one second; a gap in the cycle numbers ends a second.

@@ -5,19 +5,18 @@ Shapes and units as in `adacd_hil.lab.score.run_arrays`.
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from adacd_hil.lab.score.run_arrays import Run
-from adacd_hil.log.logged_run import Cycles, Mask, begins_alarm, is_armed_in
+from adacd_hil.log.logged_run import Cycles, Mask, begins_alarm, is_armed_in, last_armed
 from adacd_hil.records import SchemeState, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 from adacd_hil.score.emulator_truth import HostCycles, placed_contact, threshold_in_force
-from adacd_hil.score.judge import Detection, Score, TrueContact, filtered, judge, true_contacts
+from adacd_hil.score.judge import Detection, TrueContact, filtered, is_about_weight, true_contacts
 
 
 def find_detections(run: Run) -> tuple[Detection, ...]:
@@ -25,38 +24,35 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
     alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
     finals = {report.cycle: report for report in run.reports if report.is_final}
     detections = []
-    is_over = np.ones(run.state.size, np.bool_) if run.contact_joints is None else run.contact_joints != 0
     is_reported = np.isin(run.cycle, [*alarms, *finals])
-    begins = begins_alarm(run.state[:-1], run.state[1:], is_over[1:], is_reported[1:])
+    begins = begins_alarm(run.state[:-1], run.state[1:], run.contact_joints[1:] != 0, is_reported[1:])
+    armed = last_armed(run.cycle, run.state)
     for row in (np.flatnonzero(begins) + 1).tolist():
         cycle = int(run.cycle[row])
         final = finals.get(cycle)
         first = alarms.get(cycle, final)
         is_armed = bool(is_armed_in(run.state[row - 1]))
         is_known = run.truth is None or run.truth.covers(cycle)
-        detections.append(Detection(int(run.t_ns[row]), is_armed, is_known, row, first, final or first))
+        before = int(run.state[row - 1]), int(armed[row])
+        is_weight = run.truth is not None and is_about_weight(run.truth, run.settings, cycle, *before)
+        detections.append(Detection(int(run.t_ns[row]), is_armed, is_known, row, first, final or first, is_weight))
     return tuple(detections)
 
 
 def uncovered_watch(run: Run) -> Mask:
     """Return for each cycle (n,) whether it is in MONITOR and not covered by the truth.
 
-    All False without a truth, or if the truth has no `span`.
+    All False without a truth.
     """
     watched = is_armed_in(run.state)
-    if run.truth is None or run.truth.span is None:
+    if run.truth is None:
         return np.zeros_like(watched)
     return np.asarray(watched & ~run.truth.span.covers(run.cycle))
 
 
 def timed_contacts(run: Run) -> tuple[TrueContact, ...]:
-    """Return the true contacts of a run, with the times of their rows; () without the truth or cycles."""
-    truth = run.truth
-    if truth is None or run.cycle.size == 0:
-        return ()
-    if truth.time_s is None:
-        truth = replace(truth, time_s=run.time_of_s(truth.cycle))
-    return true_contacts(truth, run.first_contact)
+    """Return the true contacts of a run, with the times of their rows; () without the truth."""
+    return true_contacts(run.truth, run.first_contact)
 
 
 def contacts_of(run: Run) -> tuple[TrueContact, ...]:
@@ -74,7 +70,6 @@ def placed_in(
     host = HostCycles(run.cycle, run.t_ns, np.concatenate(([SchemeState.INIT], state[:-1])), threshold)
     placed = []
     for contact in contacts:
-        assert contact.time_s is not None
         onset_ns, end_ns = (run.zero_ns + round(float(at_s) * 1e9) for at_s in contact.time_s[[0, -1]])
         row = row_at(run, float(contact.time_s[0]))
         placed.append(placed_contact(contact, (onset_ns, end_ns), host, row, run.settings, a_rad_s))
@@ -128,25 +123,3 @@ def channels_at(run: Run, time_s: float) -> list[tuple[float, float | None, Vect
         return [(run.a_rad_s, None, threshold_in_force(run.threshold[row], run.settings))]
     thresholds = run.certified.threshold[row]
     return [(*cutoffs, threshold) for cutoffs, threshold in zip(channels_of(run.settings), thresholds, strict=True)]
-
-
-def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[Detection]) -> Score:
-    """Return which contacts a run's own scheme detected, and its false alarms.
-
-    Alarms about the weight of a changed payload are neither, see `is_payload_alarm`, for which `run` is. contacts: of
-    `contacts_of`, with onsets and arming. detections: of `find_detections`.
-    """
-    return judge(contacts, [detection for detection in detections if not is_payload_alarm(run, detection.row)])
-
-
-def is_payload_alarm(run: Run, row: int) -> bool:
-    """Return whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet.
-
-    It is if the row before is in PAYLOAD, and the true payload differs from that in the last row in MONITOR before.
-    False without the truth, without gravity, or if no row before is in MONITOR.
-    """
-    truth, armed = run.truth, np.flatnonzero(is_armed_in(run.state[:row]))
-    if truth is None or not run.settings.estimator.gravity or run.state[row - 1] != SchemeState.PAYLOAD:
-        return False
-    known, now = (truth.model_row(int(run.cycle[place])) for place in (armed[-1] if len(armed) else row, row))
-    return known is not None and now is not None and bool(truth.payload_kg[known] != truth.payload_kg[now])

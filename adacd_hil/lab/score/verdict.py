@@ -314,11 +314,7 @@ def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
         _PAYLOAD: NONE if payloads in ([], [None]) else f"{payloads[0]:g} kg",
         **{name: _residual_text(cad, place) for place, name in enumerate(_CAD)},
     }
-    ours = same | _figures(
-        metrics,
-        [residual.identified for residual in frozen],
-        [(contact.is_armed, contact.detected_s, contact.delay_ms) for contact in metrics.contacts],
-    )
+    ours = same | _figures(metrics, [residual.identified for residual in frozen])
     if run.truth is None:
         ours[_FOUND] = str(len(metrics.contacts))
     a, b = settings.filter.a_rad_s, settings.filter.b_rad_s
@@ -336,11 +332,7 @@ def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
         return _of_what_was_played(run, [*rows, PaperRow("Control rate", "1 kHz", None, rate)])
     theirs, beside = dict.fromkeys(ours, NONE), evidence.paper_beside
     if beside is not None:
-        theirs = same | _figures(
-            beside,
-            [beside.frozen_residual_max_Nm[label] for label in detections],
-            [(contact["is_armed"], contact["detected_s"], contact["delay_ms"]) for contact in beside.contacts],
-        )
+        theirs = same | _figures(beside, [beside.frozen_residual_max_Nm[label] for label in detections])
     papers = _PAPERS | dict.fromkeys(_COUNTED, NONE)
     rows = [PaperRow(quantity, paper, theirs[quantity], ours[quantity]) for quantity, paper in papers.items()]
     certified = (
@@ -363,22 +355,18 @@ def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
     return _of_what_was_played(run, rows)
 
 
-def _figures(
-    found: Metrics | Beside,
-    frozen: list[tuple[float, float] | None],
-    contacts: list[tuple[bool, float | None, float | None]],
-) -> dict[str, str]:
-    """Return a scheme's figures as text by quantity. contacts: is_armed, detected at, s, and delay, ms, of each."""
+def _figures(found: Metrics | Beside, frozen: list[tuple[float, float] | None]) -> dict[str, str]:
+    """Return a scheme's figures as text by quantity. frozen: residuals of the detection sections, Nm by joint."""
     times_s = list(found.adaptation_s.values())
-    seen = [at_s for _, at_s, _ in contacts if at_s is not None]
-    delays_ms = [delay_ms for is_armed, _, delay_ms in contacts if is_armed and delay_ms is not None]
-    armed = sum(is_armed for is_armed, _, _ in contacts)
+    seen_s = [contact.detected_s for contact in found.contacts if contact.detected_s is not None]
+    armed = [contact for contact in found.contacts if contact.is_armed]
+    delays_ms = [contact.delay_ms for contact in armed if contact.delay_ms is not None]
     return {
         _ADAPTED: _seconds(times_s, 0),
         _ADAPTED_AGAIN: _seconds(times_s, 1),
         **{name: _residual_text(frozen, place) for place, name in enumerate(_FROZEN)},
-        _FIRST_CONTACT: f"{seen[0]:.2f} s" if seen else NONE,
-        _FOUND: NONE if found.missed is None else found_text(len(delays_ms), armed),
+        _FIRST_CONTACT: f"{seen_s[0]:.2f} s" if seen_s else NONE,
+        _FOUND: NONE if found.missed is None else found_text(len(delays_ms), len(armed)),
         _DELAY: f"{float(np.median(delays_ms)):.1f} ms" if delays_ms else NONE,
         _FALSE: NONE if found.false_alarms is None else str(found.false_alarms),
     }

@@ -218,9 +218,9 @@ def _judged(
     attempt. A false alarm's samples are free for `BLOCK_S`, so that the block with its peak is. Samples that the truth
     does not cover are not free.
     """
-    counted = [contact.counted_from(begins[contact.attempt]) for contact in truth[0] if contact.attempt < len(begins)]
+    counted = [each.counted_from(begins[each.attempt]) for each in truth.contacts if each.attempt < len(begins)]
     contacts = placed_contacts([each for each in counted if cycles.cycle[0] <= each.end], cycles, settings)
-    is_known = host_span(truth[1], np.array(begins)).covers(cycles.cycle)
+    is_known = host_span(truth.span, np.array(begins)).covers(cycles.cycle)
     raised = [Detection(int(cycles.t_ns[row]), True, bool(is_known[row]), row) for row in alarms]
     false_alarms = judge(contacts, raised).false_alarms
     is_good, counted_s = is_armed.copy(), BLOCK_S + APART_S

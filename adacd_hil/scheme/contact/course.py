@@ -59,7 +59,7 @@ class CourseMemory:
 
     link: touched link, 0 for none. is_open: a report has been made that is not final yet. direction: sign of each
     joint's torque when it crossed its threshold, 0 before. level: the highest of this contact. cause_link: link for
-    which the reaction was chosen. is_given_up: a withdrawal was given up for the `two_sided` reaction. cycles: of the
+    which the reaction was chosen. is_two_sided: a withdrawal was given up for the `two_sided` reaction. cycles: of the
     withdrawal in force; turned_cycles: the last ones in a row with the torque turned against it. kept_rows: rows
     written so far in the history for reports. early_rows: those of the contact before its detection. way: direction of
     a withdrawal, a unit vector; zeros without one.
@@ -74,7 +74,6 @@ class CourseMemory:
     level: int
     cause_link: int
     is_two_sided: int
-    is_given_up: int
     cycles: int
     turned_cycles: int
     kept_rows: int
@@ -145,7 +144,7 @@ def follow(
         m.is_open, m.detected_cycle = 1, cycle
         m.direction[:] = 0
         m.link = 2 if joints & 2 else 1
-        m.is_two_sided = m.is_given_up = 0
+        m.is_two_sided = 0
         m.level, m.cause_link = level, m.link
         _choose(k, m, tau_ext_hat, is_valid)
     elif m.link:
@@ -195,7 +194,7 @@ def _reconsider(
     """
     level = max(level, m.level)
     is_other = level != m.level or m.link != m.cause_link
-    if is_other and m.cause_link and not m.is_given_up:
+    if is_other and m.cause_link and not m.is_two_sided:
         m.level, m.cause_link = level, m.link
         _choose(k, m, tau_ext_hat, is_valid)
     if is_latched and goes_on(m) and m.level == _CONTACT:
@@ -247,5 +246,5 @@ def _judge(k: CourseConstants, m: CourseMemory, tau_ext_hat: Vector, is_valid: b
     along_Nm, bound_Nm = linalg.dot(tau_ext_hat, m.way), linalg.dot(np.abs(m.way), k.collision_Nm)
     m.turned_cycles = m.turned_cycles + 1 if along_Nm < -bound_Nm else 0
     if m.turned_cycles >= TURNED_CYCLES:
-        m.is_two_sided = m.is_given_up = 1
+        m.is_two_sided = 1
         _react(m, _possible(k.two_sided, is_valid), tau_ext_hat, True)

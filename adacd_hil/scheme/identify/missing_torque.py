@@ -233,7 +233,7 @@ def _is_found_again(k: Constants, m: Memory) -> bool:
     own = m.missing_torque
     own.rms_Nm[:] = 0.0
     last_found, count, basic, full = own.last_found, m.models.belief.shape[0], own.basic, own.full
-    if k.position_torque_Nm or not np.any(last_found):
+    if not np.any(last_found):
         return False
     b = own.row
     b[:] = own.b

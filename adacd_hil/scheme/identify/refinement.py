@@ -46,7 +46,7 @@ def test(k: Constants, m: Memory) -> bool:
             if c == filter_bank.SLOW and m.sensitivity.still[c, i] < sensitivity.MOVING:
                 own.square += residual * residual
                 own.frozen_square += m.filters.r[c, i] ** 2
-            bare = max(m.filters.r.shape[0] + c - 1, 0) if c > 0 else 0
+            bare = m.filters.r.shape[0] + c - 1 if c > 0 else 0
             own.worst = max(own.worst, abs(residual) / m.sensitivity.h[bare, i])
     if own.cycles < k.refine_cycles:
         return False

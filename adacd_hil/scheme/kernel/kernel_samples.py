@@ -49,10 +49,9 @@ def fill_sample(samples: Structured, arm: ArmState, request: int) -> None:
 def samples_of(arms: ArmBatch, requests: NDArray[np.uint8]) -> Structured:
     """Return arm states and requests of n cycles as an array of type SAMPLE (n,); `age`: that of the oldest value."""
     samples = np.zeros(arms.cycle.size, SAMPLE)
-    for name in ("cycle", "periods", "steps", "sampled_ns", "fault", "is_complete", "is_enabled", "is_late"):
-        samples[name] = getattr(arms, name)
-    for name in ("q", "dq", "tau_J"):
-        samples[name] = getattr(arms, name)
+    for name in SAMPLE.names or ():
+        if name not in ("age", "request"):
+            samples[name] = getattr(arms, name)
     samples["age"] = np.maximum(arms.age_q.max(axis=1, initial=0), arms.age_tau_J.max(axis=1, initial=0))
     samples["request"] = requests
     return samples

@@ -96,7 +96,6 @@ class Pipeline(ABC):
         self.theta_ff = np.zeros(len(settings.estimator.parameter_names))
         self._course_constants, self._course_memory = new_course(settings)
         self._course: RunMemory = self._course_memory[0]
-        self._theta_hat = layout_of(settings).slices["theta_hat"]
         self._sample, self._decision = np.zeros(1, SAMPLE), np.zeros(1, DECISION)
         self._block = np.zeros((1, numbers.values.size))
 
@@ -167,7 +166,6 @@ class Pipeline(ABC):
         asked = self._cycle(self._sample, self._decision, self._block, 0, *self._cycle_arrays)
         contact = self._finish(asked, self._sample, self._decision, 0) if asked else None
         state, previous_state, fault, reaction, contact_joints, _, is_model_valid = self._decision.item()
-        block = self._block[0].copy()
         return SchemeOutput(
             cycle=arm.cycle,
             state=_STATES[state],
@@ -175,11 +173,10 @@ class Pipeline(ABC):
             fault=_FAULTS[fault],
             contact_joints=contact_joints,
             is_model_valid=bool(is_model_valid),
-            theta_hat=block[self._theta_hat],
             theta_ff=self.theta_ff,
             tau_ext_hat=self.tau_ext_hat.copy(),
             contact=contact,
-            block=block,
+            block=self._block[0].copy(),
             reaction=_REACTIONS[reaction],
         )
 
