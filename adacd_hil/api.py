@@ -12,30 +12,6 @@ Everything else may move; these names stay. docs/api.md has examples.
 | `SchemeState`, `ContactReport`, `Certificate`, `LogError` | types of the results |
 """
 
-__all__ = [
-    "Arm",
-    "ArrayContact",
-    "ArrayError",
-    "Bus",
-    "Certificate",
-    "ContactReport",
-    "Detection",
-    "Detector",
-    "Frame",
-    "LoadedRun",
-    "LogError",
-    "Model",
-    "RunContact",
-    "RunEvent",
-    "SchemeState",
-    "Verdict",
-    "check_detector",
-    "detect",
-    "fit",
-    "load",
-    "register_detector",
-]
-
 _LIBRARY = "adacd_hil.lab.library"
 PLACES = {
     "Arm": (f"{_LIBRARY}.array_detection", "OfflineArm"),
@@ -60,6 +36,7 @@ PLACES = {
     "load": (f"{_LIBRARY}.loaded_run", "load"),
     "register_detector": ("adacd_hil.lab.detectors.detector_registry", "register"),
 }
+__all__ = list(PLACES)
 
 
 def __getattr__(name: str) -> object:

@@ -19,7 +19,7 @@ import stat
 import tempfile
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -34,7 +34,7 @@ from numba.core.caching import (
     _CacheLocator,
 )
 
-from adacd_hil.compile_progress import CompileCount, full_name, functions_below
+from adacd_hil.compile_progress import call_listeners
 
 _ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("adacd_hil", "firmware_sim")
@@ -252,13 +252,6 @@ class _CacheFile(IndexDataCacheFile):
         found = super().load(key)  # type: ignore[no-untyped-call]
         return self._shipped.load(key) if found is None else found  # type: ignore[no-untyped-call]
 
-    def version(self) -> int | None:
-        """Return a number that changes whenever any process saves code of this function; None: there is no code."""
-        for path in (self._index_path, self._shipped._index_path):
-            with contextlib.suppress(OSError):
-                return Path(path).stat().st_mtime_ns
-        return None
-
 
 class _SharedCache(FunctionCache):
     """numba's cache on disk, for processes that compile at the same time.
@@ -272,9 +265,7 @@ class _SharedCache(FunctionCache):
     def __init__(self, function: Any) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]
         locator = self._impl.locator
-        self._cache_file: _CacheFile = _CacheFile(
-            locator.get_cache_path(), self._impl.filename_base, locator.get_source_stamp()
-        )
+        self._cache_file = _CacheFile(locator.get_cache_path(), self._impl.filename_base, locator.get_source_stamp())
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the code compiled for these types; None: this process has to compile it, then save it.
@@ -300,12 +291,8 @@ class _SharedCache(FunctionCache):
         finally:
             _claims.release(self._claim(sig))
 
-    def version(self) -> int | None:
-        """Return a number that changes whenever code of this function is saved on the disk; None: there is none."""
-        return self._cache_file.version()
-
     def _claim(self, sig: Any) -> str:
-        return f"{full_name(self._py_func)} {sig}"
+        return f"{self._py_func.__module__}.{self._py_func.__qualname__} {sig}"
 
 
 def compiled(function: Function) -> Function:
@@ -331,15 +318,9 @@ class _Compilation(event.Listener):
     """Counts compilations and calls the listeners. Garbage collection pauses meanwhile; it took a tenth of the time."""
 
     def __init__(self) -> None:
-        self._depth = 0
+        self._depth = self._count = 0
         self._was_collecting = False
-        self._count = self.new_count(())
         self._on_first: Callable[[], None] | None = None
-
-    def new_count(self, functions: Sequence[Any]) -> CompileCount:
-        """Start and return a count of compiled functions, out of these and all that they call."""
-        self._count = CompileCount(functions_below(functions), lambda function: function._cache.version())
-        return self._count
 
     def on_start(self, event: Any) -> None:  # noqa: ARG002
         """Pause garbage collection as a function begins to compile; call `on_first`, once, and the listeners."""
@@ -347,10 +328,10 @@ class _Compilation(event.Listener):
             self._was_collecting = gc.isenabled()
             gc.disable()
         self._depth += 1
-        begin, self._on_first = self._on_first, None
-        if begin is not None:
-            begin()
-        self._count.call_listeners()
+        if self._on_first is not None:
+            on_first, self._on_first = self._on_first, lambda: None
+            on_first()
+        self.call_listeners()
 
     def on_end(self, event: Any) -> None:
         """Count a compiled function and call the listeners; do neither for one of numba's own.
@@ -361,29 +342,27 @@ class _Compilation(event.Listener):
         if self._depth == 0 and self._was_collecting:
             gc.enable()
         if isinstance(event.data["dispatcher"]._cache, _SharedCache):  # not one of numba's own
-            self._count.count_function(event.data["dispatcher"])
+            self._count += 1
+            self.call_listeners()
 
     def call_listeners(self) -> None:
-        """Call the listeners, each with a function that returns the present count as a line."""
-        self._count.call_listeners()
+        """Call the listeners with the present count as a line."""
+        call_listeners(self._count)
 
     @contextmanager
-    def of(self, functions: Sequence[Any], on_first: Callable[[], None] = lambda: None) -> Iterator[None]:
-        """Count functions that compile in the block toward these functions and all that they call.
+    def of(self, on_first: Callable[[], None]) -> Iterator[None]:
+        """Call `on_first` before the first function that compiles in the block.
 
-        on_first: called before the first function is compiled, not at all if all come from the cache. Do neither if a
-        block around it counts already.
+        It isn't called if all functions come from the cache, nor in a block within another.
         """
-        if self._on_first is not None or self._count.is_expecting:
+        if self._on_first is not None:
             yield
             return
-        self.new_count(functions)
         self._on_first = on_first
         try:
             yield
         finally:
             self._on_first = None
-            self.new_count(())
 
 
 _compilation = _Compilation()

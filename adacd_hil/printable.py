@@ -1,4 +1,4 @@
-"""Text from files or the bus made printable, so that it can't control a terminal."""
+"""Text for people: from files or the bus, made printable so that it can't control a terminal; a count with its noun."""
 
 import re
 
@@ -23,3 +23,8 @@ def one_line(text: object) -> str:
     """Return a text in one line, white space as single spaces, control characters escaped, cut at 2000 letters."""
     line = plain(" ".join(str(text).split()))
     return line if len(line) <= _MOST_LETTERS else f"{line[:_MOST_LETTERS]} …"
+
+
+def number_of(count: int, noun: str) -> str:
+    """Return a count and its noun, such as "2 cycles"; the noun, given in the singular, gets an s unless it is one."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"

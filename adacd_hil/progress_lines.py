@@ -3,7 +3,6 @@
 import queue
 import sys
 import threading
-from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Self
 
@@ -47,8 +46,8 @@ class Progress:
         self._is_counting = False
         self._lines.put((line, self._has_cursor))
 
-    def count(self, line: Callable[[], str]) -> None:
-        """Queue `line()` with the seconds since counting began, unless that or the last count is too recent.
+    def count(self, line: str) -> None:
+        """Queue `line` with the seconds since counting began, unless that or the last count is too recent.
 
         Too recent: less than COUNT_EVERY_NS ago on a terminal, LINES_EVERY_NS elsewhere. Counting begins anew after any
         other line. On a terminal the next line overwrites the count.
@@ -58,7 +57,7 @@ class Progress:
             self._is_counting, self._begun_ns, self._counted_ns = True, now_ns, now_ns
         if now_ns - self._counted_ns >= self._pause_ns:
             self._counted_ns = now_ns
-            self._lines.put((f"{line()}, {(now_ns - self._begun_ns) / 1e9:.0f} s", self._has_cursor))
+            self._lines.put((f"{line}, {(now_ns - self._begun_ns) / 1e9:.0f} s", self._has_cursor))
 
     def _print(self) -> None:
         """Print the queued lines until None comes; overwrite a passing one with the next."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from adacd_hil.cli.connection import check_shared, make_clock, model_time, on_interrupt
+from adacd_hil.cli.connection import make_clock, model_time, on_interrupt
 from adacd_hil.clock import LOCKSTEP
 from adacd_hil.control.cycle_compilation import compiling_cycle
 from adacd_hil.control.operator import ScriptedOperator
@@ -22,12 +22,12 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import configuration_layers, load_settings, resolved_table
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import RequestSettings
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.bench.bench_time import TruthLog
-from firmware_sim.body.body import Body
 from firmware_sim.canopen.object_dictionary import EmulatedContract, playable_contract
 from firmware_sim.cli.own_devices import rehearse_settings
 from firmware_sim.scenario.rehearsal import told_arm
@@ -108,11 +108,12 @@ def run_embedded(
 
     clock_name: `lockstep` or `realtime`. progress: takes lines about the run. live: serves the host's log to viewers;
     None: not served. on_started: called when the devices become Operational for the first time. Raises ConfigError,
-    CodecError or LogError for invalid settings or logs, OSError if a file can't be written, CommandError for a
-    configuration of several arms. After an error the truth's log is discarded.
+    CodecError or LogError for invalid settings, such as those of several arms, or logs, OSError if a file can't be
+    written. After an error the truth's log is discarded.
     """
     settings, scenario = cast.settings, cast.scenario
-    check_shared(LOCKSTEP, settings)  # an arm in this process is alone on its bus
+    if settings.bus.is_shared:
+        raise ConfigError(f"`bus.arms` = {settings.bus.arms}: the arm of this process is alone on its bus, 1 expected")
     devices = place_devices(settings)
     codec = load_contract(settings, devices)
     if excess := describe_excess(codec, settings):
@@ -132,7 +133,7 @@ def run_embedded(
                 touched_ns = None if block[_TOUCHED_LINK] == 0.0 else touched_ns or t_ns
                 truth.write(cycle, t_ns, block)
 
-            with compiling_cycle(settings, Body.compiled_functions):
+            with compiling_cycle(settings):
                 bench = Bench(
                     scenario,
                     codec,

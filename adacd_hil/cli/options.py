@@ -278,16 +278,18 @@ def _live_view(host: str, port: int, origins: tuple[str, ...], names: tuple[str,
 
 
 def _check_port(host: str, port: int) -> None:
-    """Raise CommandError if the port can't be listened on, such as one in use; 0 always passes.
+    """Raise CommandError if the port can't be listened on, such as one in use, or the host has no address.
 
-    Call it before time is spent on compiling.
+    The port 0, of any that is free, is not tried. Call it before time is spent on compiling.
     """
     try:
-        places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM) if port else ()
-        for family, kind, protocol, _, address in places:
+        places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        for family, kind, protocol, _, address in places if port else ():
             with socket.socket(family, kind, protocol) as probe:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
     except OSError as error:
         remedy = "; --live-port 0 takes one that is free" if error.errno == errno.EADDRINUSE else ""
         raise CommandError(f"can't listen on {host}:{port}: {error.strerror}{remedy}", ExitCode.FAILURE) from None
+    except UnicodeError:
+        raise CommandError(f"can't listen on {host}:{port}: that is no name of a machine", ExitCode.FAILURE) from None

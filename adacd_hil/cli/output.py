@@ -264,11 +264,6 @@ def _as_typed(line: str) -> str:
 _GOES_ON = " \\"
 
 
-def counted(count: int, noun: str) -> str:
-    """Return a count and its noun, such as "2 cycles"; the noun, given in the singular, gets an s unless count is 1."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
 def quoted(path: Path) -> str:
     """Return a path quoted for a shell."""
     return shlex.quote(str(path))

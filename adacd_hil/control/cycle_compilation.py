@@ -6,9 +6,8 @@ Both keep their results in the same cache, and neither compiles a function that 
 import contextlib
 import os
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 from adacd_hil.compiled import compiling
 from adacd_hil.log.recording.processes import read_setup, start_module
@@ -19,11 +18,11 @@ _MODULE = "adacd_hil.control.cycle_compilation"
 
 
 @contextmanager
-def compiling_cycle(settings: Settings, further: Sequence[Any] = ()) -> Iterator[None]:
-    """Report the progress of compiling the cycle's functions, and `further` ones, while the `with` block compiles them.
+def compiling_cycle(settings: Settings) -> Iterator[None]:
+    """Have a second process compile the longest of the cycle's functions while the `with` block compiles them all.
 
-    further: compiled functions. With a second processor and anything to compile, start a second process that compiles
-    the longest ones; end it with the block.
+    It starts with the first function that the block compiles, if there is a second processor, and ends with the block.
+    A block within another starts none.
     """
     helpers: list[subprocess.Popen[bytes]] = []
 
@@ -33,7 +32,7 @@ def compiling_cycle(settings: Settings, further: Sequence[Any] = ()) -> Iterator
                 helpers.append(start_module(_MODULE, (), settings, subprocess.DEVNULL))
 
     try:
-        with compiling([*new_pipeline(settings).compiled_functions, *further], start):
+        with compiling(start):
             yield
     finally:
         for helper in helpers:

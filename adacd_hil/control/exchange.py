@@ -8,6 +8,7 @@ from adacd_hil.control.pacing import MOST_FRAMES, Pacer, Tick
 from adacd_hil.device.arm import FEEDBACK_SHARE, Arm
 from adacd_hil.device.arm_watch import RateLimitedEvents, Recurrence
 from adacd_hil.device.network import Master
+from adacd_hil.printable import number_of
 from adacd_hil.records import ArmCommand, ArmState, CycleRecord, Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import NOTHING_QUEUED, Frame, SilenceError, Tap
@@ -85,8 +86,7 @@ class Exchange:
         They act one SYNC later.
         """
         count, from_cycle = self._commands_late, cycle - self._acts_after
-        what = f"1 command of cycle {from_cycle}" if count == 1 else f"{count} commands of cycle {from_cycle}"
-        text = f"{what} missed SYNC {cycle}, so acting one later"
+        text = f"{number_of(count, 'command')} of cycle {from_cycle} missed SYNC {cycle}, so acting one later"
         self.events.report(self.sync_ns, "late", Event("warning", "late commands", text), count)
 
     def _await_feedback(self, last_ns: int) -> int:
@@ -166,8 +166,7 @@ class Exchange:
         frames_lost = self._bus.frames_lost
         if frames_lost != self._said_lost and self.events.is_due("lost", command_ns):
             count, self._said_lost = frames_lost - self._said_lost, frames_lost
-            what = "1 received frame" if count == 1 else f"{count} received frames"
-            text = f"{what} dropped by the kernel: this host reads too late"
+            text = f"{number_of(count, 'received frame')} dropped by the kernel: this host reads too late"
             self.events.report(command_ns, "lost", Event("warning", "bus", text))
         # If SYNC is followed, it is the grid point itself, however late this host woke up for it.
         late_ns = 0 if self._is_following else tick.lateness_ns

@@ -21,6 +21,7 @@ from adacd_hil.device.network import Identity
 from adacd_hil.file_access import read_input
 from adacd_hil.file_replacement import dangling_link, replacing
 from adacd_hil.log.log_files import HISTORY_NAME
+from adacd_hil.printable import number_of
 from adacd_hil.records import Event
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.settings.configuration import Settings
@@ -207,8 +208,7 @@ class UsedHistory:
 
     def _count(self) -> str:
         """Return the number of certificates that were read, as text."""
-        count = 0 if self.history is None else len(self.history.certificates)
-        return f"{count} certificate{'' if count == 1 else 's'}"
+        return number_of(0 if self.history is None else len(self.history.certificates), "certificate")
 
     def attachments(self) -> dict[str, bytes]:
         """Return the file's text, by its name in the log; none in a first run."""

@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 from adacd_hil.device.canopen_bus import EdsVariable
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, ObjectName, PdoSettings, PlacedDevice
-from adacd_hil.file_access import exists
-from adacd_hil.remedies import hint
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.toml_files import find_named
 from adacd_hil.wire.codec import Codec, MessageCodec
 from adacd_hil.wire.contract_frames import (
     EMERGENCY_ID,
@@ -121,14 +120,7 @@ def find_contract(name: str) -> Path:
 
     Raises ConfigError for any other text, with the nearest name if there is one.
     """
-    folder = contract_folder()
-    if exists(folder / f"{name}.dbc"):
-        return folder / f"{name}.dbc"
-    path = Path(name)
-    if name and (path.suffix or exists(path)):
-        return path
-    known = sorted(path.stem for path in folder.glob("*.dbc"))
-    raise ConfigError(f"contract {name!r} is neither in dbc/ nor a file; {hint(name, known)}")
+    return find_named("contract", name, contract_folder(), ".dbc")
 
 
 def _move(codec: Codec, settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:

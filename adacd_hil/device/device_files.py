@@ -15,7 +15,7 @@ from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_files import find_toml, parse_toml, read_toml, toml_names
+from adacd_hil.settings.toml_files import find_named, parse_toml, read_toml, toml_names
 from adacd_hil.wire.dbc_contract import contract_folder
 
 _MOST_EXTENDED = 8
@@ -37,7 +37,7 @@ def load_profile(name_or_file: str, kind: str) -> DeviceProfile:
     unknown name or key, a value outside its bounds, an EDS that is missing or can't be read, another kind. The EDS is
     not parsed.
     """
-    path = find_toml("device profile", name_or_file, _builtin_folder())
+    path = find_named("device profile", name_or_file, _builtin_folder())
     try:
         table, folders = _read_profile(path)
         settings = parse(ProfileSettings, table)
@@ -68,7 +68,7 @@ def _read_profile(path: Path, depth: int = 0) -> tuple[dict[str, Any], list[Path
     if not isinstance(extended, str) or depth >= _MOST_EXTENDED:
         raise ConfigError(f"`extends` = {extended!r} must be the name of a profile, at most {_MOST_EXTENDED} in a row")
     beside = path.parent / extended
-    base = beside if beside.is_file() else find_toml("device profile", extended, _builtin_folder())
+    base = beside if beside.is_file() else find_named("device profile", extended, _builtin_folder())
     below, folders = _read_profile(base, depth + 1)
     merged = below | table
     for key in MERGED:

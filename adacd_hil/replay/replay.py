@@ -26,6 +26,7 @@ from adacd_hil.log.log_files import SCRIPTED, SHOWN, LogError
 from adacd_hil.log.logged_run import Milestones, Mismatch, Progress, is_armed_in
 from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
+from adacd_hil.printable import number_of
 from adacd_hil.records import ArmBatch, Event, Request, SchemeState
 from adacd_hil.replay.can_recording import RecordingAlone
 from adacd_hil.replay.log_source import SAID, CycleStretch, LogSource, Part
@@ -40,7 +41,7 @@ from adacd_hil.replay.scheme_comparison import (
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.scheme.pipeline.pipeline import Pipeline, SchemeBatch
 from adacd_hil.score.emulator_truth import KnownContacts, contacts_beside
-from adacd_hil.score.wording import number_of, unjudged_sentence
+from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
 
 _PROGRESS_CYCLES: Final = 200_000

@@ -18,23 +18,6 @@ LOW_PERCENTILE_NAMES = (*(f"p{100.0 - share:g}" for share in PERCENTILES[:-1]), 
 Values = NDArray[np.int64] | NDArray[np.float64]
 
 
-def percentiles(values: Values) -> dict[str, float]:
-    """Return PERCENTILES by PERCENTILE_NAMES, each a value that occurred (no interpolation); {} without any."""
-    if values.size == 0:
-        return {}
-    found = np.percentile(values, PERCENTILES, method="higher")
-    return dict(zip(PERCENTILE_NAMES, map(float, found), strict=True))
-
-
-def low_percentiles(values: Values) -> dict[str, float]:
-    """Return the mirrored PERCENTILES by LOW_PERCENTILE_NAMES, each a value that occurred; {} without any.
-
-    For values that must not be small.
-    """
-    mirrored = percentiles(-values)
-    return {name: -value for name, value in zip(LOW_PERCENTILE_NAMES, mirrored.values(), strict=False)}
-
-
 EXACT: Final = 500_000
 """Values that are kept as they are: eight minutes at 1 kHz."""
 _BINS_PER_OCTAVE: Final = 12
@@ -103,10 +86,7 @@ class Distribution:
         Up to `exact` values each is one that occurred. Of more, all but the smallest and the largest value are the ends
         of their bins that are nearer to 0.
         """
-        if self._bins is None:
-            return percentiles(self._values())
-        ranks = [int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]
-        return dict(zip(PERCENTILE_NAMES, map(self._at, ranks), strict=True))
+        return dict(zip(PERCENTILE_NAMES, map(self._at, self._ranks()), strict=False))
 
     def low_percentiles(self) -> dict[str, float]:
         """Return the mirrored PERCENTILES by LOW_PERCENTILE_NAMES, for values that mustn't be small; {} without any.
@@ -114,10 +94,8 @@ class Distribution:
         Up to `exact` values each is one that occurred. Of more, all but the smallest and the largest value are the ends
         of their bins that are nearer to 0.
         """
-        if self._bins is None:
-            return low_percentiles(self._values())
-        ranks = [self.count - 1 - int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]
-        return dict(zip(LOW_PERCENTILE_NAMES, map(self._at, ranks), strict=True))
+        mirrored = (self.count - 1 - rank for rank in self._ranks())
+        return dict(zip(LOW_PERCENTILE_NAMES, map(self._at, mirrored), strict=False))
 
     def median(self) -> float:
         """Return the median, of an even number the mean of the middle two.
@@ -126,23 +104,22 @@ class Distribution:
         """
         if self.count == 0:
             return float("nan")
-        if self._bins is None:
-            return float(np.median(self._values()))
         return 0.5 * (self._at((self.count - 1) // 2) + self._at(self.count // 2))
 
-    def _values(self) -> NDArray[np.float64]:
-        """Return the values that are kept as they are, as one array."""
-        self._kept = [np.concatenate(self._kept)] if self._kept else [np.empty(0)]
-        return self._kept[0]
+    def _ranks(self) -> list[int]:
+        """Return the ranks of PERCENTILES, from 0 in ascending order, rounded up; [] without a value."""
+        return [int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES] if self.count else []
 
     def _at(self, rank: int) -> float:
-        """Return the value of a rank from 0 in ascending order: the end of its bin that is nearer to 0.
+        """Return the value of a rank from 0 in ascending order; if the values are in bins, its bin's end nearer to 0.
 
-        The first and the last are exact. Call it only if the values are in bins.
+        The first and the last are exact.
         """
         if rank in (0, self.count - 1):
             return self._range[rank != 0]
-        assert self._bins is not None
+        if self._bins is None:
+            self._kept = [np.sort(np.concatenate(self._kept), kind="stable")]  # fast where they are sorted already
+            return float(self._kept[0][rank])
         place = int(np.searchsorted(np.cumsum(self._bins), rank, side="right")) - _SIDE
         if place == 0:
             return 0.0

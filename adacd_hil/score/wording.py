@@ -2,6 +2,8 @@
 
 from typing import Final
 
+from adacd_hil.printable import number_of
+
 NONE: Final = "–"
 
 
@@ -13,11 +15,6 @@ def why_not_found(is_armed: bool) -> str:
 def found_text(found: int, contacts: int) -> str:
     """Return as text how many contacts were found, such as "3 of 4"."""
     return f"{found} of {contacts}"
-
-
-def number_of(count: int, noun: str) -> str:
-    """Return a count with its noun as text, such as "2 cycles"."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def unjudged_sentence(count: int) -> str:

@@ -10,7 +10,7 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.parsing import WITHDRAWN, parse
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.stated import ARM_PROFILES
-from adacd_hil.settings.toml_files import builtin_folder, builtin_names, find_toml, read_toml
+from adacd_hil.settings.toml_files import builtin_folder, builtin_names, find_named, read_toml
 
 _LONGEST_CHAIN = 8
 """Most configurations that one configuration may extend, directly and by those that it extends."""
@@ -144,7 +144,7 @@ def _load_chain(name_or_file: str, seen: tuple[str, ...] = ()) -> list[Configura
         raise ConfigError(f"configuration {name_or_file} extends itself")
     if len(seen) > _LONGEST_CHAIN:
         raise ConfigError(f"configuration {seen[0]} extends more than {_LONGEST_CHAIN} others, one by one")
-    path = find_toml("configuration", name_or_file, builtin_folder())
+    path = find_named("configuration", name_or_file, builtin_folder())
     table = read_toml(path)
     table.setdefault("name", path.stem)
     _find_beside(table, path.parent)

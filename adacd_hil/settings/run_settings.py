@@ -351,19 +351,17 @@ class HistorySettings:
 
     def __post_init__(self) -> None:
         frictions = len(FRICTION_SPEEDS_RAD_S) * JOINTS
-        for name, values, count in (
-            ("friction_Nm", self.friction_Nm, frictions),
-            ("friction_std_Nm", self.friction_std_Nm, frictions),
-            ("inertia_kgm2", self.inertia_kgm2, 3),
-            ("inertia_std_kgm2", self.inertia_std_kgm2, 3),
-            ("offset_Nm", self.offset_Nm, JOINTS),
-            ("offset_std_Nm", self.offset_std_Nm, JOINTS),
+        for name, count in (
+            ("friction_Nm", frictions),
+            ("friction_std_Nm", frictions),
+            ("inertia_kgm2", 3),
+            ("inertia_std_kgm2", 3),
+            ("offset_Nm", JOINTS),
+            ("offset_std_Nm", JOINTS),
         ):
-            wanted = count if self.is_known else 0
-            if len(values) != wanted:
-                raise ValueError(
-                    f"{name} has {len(values)} values, {wanted} expected with date_utc = {self.date_utc!r}"
-                )
+            found, wanted = len(getattr(self, name)), count if self.is_known else 0
+            if found != wanted:
+                raise ValueError(f"{name} has {found} values, {wanted} expected with date_utc = {self.date_utc!r}")
 
     @property
     def is_known(self) -> bool:

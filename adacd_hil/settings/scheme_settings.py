@@ -197,8 +197,10 @@ class CertifiedSettings:
     def __post_init__(self) -> None:
         if len(self.cutoffs_rad_s) < 2:
             raise ConfigError(f"`certified.cutoffs_rad_s` has {len(self.cutoffs_rad_s)} values, at least 2 expected")
-        if list(self.cutoffs_rad_s) != sorted(self.cutoffs_rad_s):
+        if list(self.cutoffs_rad_s) != sorted({*self.cutoffs_rad_s}):
             raise ConfigError(f"`certified.cutoffs_rad_s` = {self.cutoffs_rad_s} must go from slow to fast")
+        if len({*self.friction_terms}) < len(self.friction_terms):
+            raise ConfigError(f"`certified.friction_terms` = {self.friction_terms} has a term twice")
         for name in ("prior_std", "enough_std", "drift_std", "model_error"):
             count = len(getattr(self, name))
             if count != 7:

@@ -1,8 +1,8 @@
 """The keys of a configuration: their list, their values in words, and changes of single ones.
 
 `known_keys` lists every key with type, default, bounds, unit and meaning. `apply_settings` changes single keys: a key
-is dotted, `detector.threshold_Nm`; a value is TOML, where a word needs no quotes and a single value stands for a list
-of it, unless the list may be absent. Settings that determined the numbers of a log can't be changed for its replay.
+is dotted, `detector.threshold_Nm`; a value is TOML, where a word needs no quotes and a single value stands for a list,
+see `apply_settings`. Settings that determined the numbers of a log can't be changed for its replay.
 """
 
 import dataclasses
@@ -13,6 +13,7 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
+from adacd_hil.plain_values import plain_values
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.parsing import describe_gone, parse
@@ -129,8 +130,10 @@ _FACTS: Final = ("profile", "sign", "torque_offset_Nm", "torque_offset_std_Nm", 
 def apply_settings(settings: Settings, changes: Mapping[str, str]) -> Settings:
     """Return the settings with some keys changed. changes: by dotted key, a TOML value as text.
 
-    A word needs no quotes; a single value stands for a list of it, unless the list may be absent. Raises ConfigError
-    for an unknown key, a text that is no TOML value, and a value that `parse` refuses.
+    A word needs no quotes. A single value stands for a list, unless that may be absent: it fills a list of fixed length
+    and one of floats, such as `certified.prior_std`; any other list, such as `certified.friction_terms`, and an empty
+    one get it alone. Raises ConfigError for an unknown key, a text that is no TOML value, and a value that `parse_toml`
+    or `parse` refuses.
     """
     table = tomllib.loads(to_toml(settings))
     known = known_keys()
@@ -160,28 +163,30 @@ def refuse_log_settings(changes: Mapping[str, str]) -> None:
 def _read_value(key: str, text: str) -> Any:
     """Parse a text as a TOML value.
 
-    Return a text that is no TOML as a string, for words without quotes. Raises ConfigError, which names the key, for
-    such a text if it is empty or holds a quote, bracket, brace, `=`, `#` or newline.
+    Return a text that is no TOML as a string, for words without quotes. Raises ConfigError for such a text if it is
+    empty or holds a quote, bracket, brace, `=`, `#` or newline, and for a value that `parse_toml` refuses.
     """
     try:
-        return parse_toml(f"value = {text}")["value"]
-    except ConfigError:
+        return parse_toml(f'"{key}" = {text}')[key]
+    except ConfigError as error:
+        if error.__cause__ is None:
+            raise
         if text and not set(text) & set("\"'[]{}=\n#"):
             return text
         raise ConfigError(f"`{key}` = {text} is not a TOML value") from None
 
 
 def _spread(value: Any, kind: Any, present: Any) -> Any:
-    """Return a single value repeated to a list if the setting is a list that can't be absent; else return the value.
+    """Return a single value as a list if the setting is a list that can't be absent; else return the value.
 
-    kind: the setting's type. The list is as long as `present`, the setting's value so far, or, if that is no list, as
-    `kind` says.
+    kind: the setting's type. present: the setting's value so far. A list of fixed length, and one of floats unless it
+    is empty, keeps its length; any other list has the value alone.
     """
-    if typing.get_origin(kind) is tuple and not isinstance(value, list):
-        elements = [element for element in typing.get_args(kind) if element is not Ellipsis]
-        count = len(present) if isinstance(present, list) else len(elements)
-        return [value] * count
-    return value
+    if typing.get_origin(kind) is not tuple or isinstance(value, list):
+        return value
+    element, *others = typing.get_args(kind)
+    keeps_length = element is float or Ellipsis not in others
+    return [value] * (len(present) if keeps_length and present else 1)
 
 
 def keep_log_settings(own: Settings, other: Settings) -> Settings:
@@ -248,18 +253,10 @@ def split_list(text: str) -> list[str]:
 
 def changed_keys(before: Settings, after: Settings) -> dict[str, tuple[str, str]]:
     """Return the settings that differ, by dotted key: (before, after) as Python writes them; `unset` for None."""
-    tables = [_flat(tomllib.loads(to_toml(settings)), "") for settings in (before, after)]
-    keys = [*tables[0], *(key for key in tables[1] if key not in tables[0])]
-    words = {key: (tables[0].get(key, "unset"), tables[1].get(key, "unset")) for key in keys}
-    return {key: pair for key, pair in words.items() if pair[0] != pair[1]}
+    keys = [key for key, known in known_keys().items() if not known.is_in_row]
+    pairs = {key: (_as_python(value_of(before, key)), _as_python(value_of(after, key))) for key in keys}
+    return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
 
-def _flat(table: Mapping[str, Any], prefix: str) -> dict[str, str]:
-    """Return the values of a table and its inner tables as Python writes them, by dotted key after `prefix`."""
-    flat: dict[str, str] = {}
-    for key, value in table.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = repr(value)
-    return flat
+def _as_python(value: Any) -> str:
+    return "unset" if value is None else repr(plain_values(value))

@@ -1,4 +1,4 @@
-"""TOML files: found by name, and read within limits."""
+"""Files found by their built-in names, and TOML files, read within limits."""
 
 import re
 import tomllib
@@ -50,9 +50,10 @@ def _instead(path: Path, kind: str) -> str:
 
 
 def parse_toml(text: bytes | str) -> dict[str, Any]:
-    """Return the table of a TOML text, at most 16 deep, with integers of 64 bits. Raises ConfigError with the reason.
+    """Return the table of a TOML text, at most 16 deep, with integers of 64 bits.
 
-    A byte order mark at the beginning, as editors on Windows write it, is ignored.
+    A byte order mark at the beginning, as editors on Windows write it, is ignored. Raises ConfigError with the reason;
+    its cause is a TOMLDecodeError for a text that is no TOML, else None.
     """
     try:
         decoded = (text if isinstance(text, str) else text.decode("utf-8")).removeprefix("\ufeff")
@@ -67,7 +68,7 @@ def parse_toml(text: bytes | str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         comma = _DECIMAL_COMMA.search(decoded)
         hint = f"; `{comma[0]}`: a decimal point, not a comma?" if comma else ""
-        raise ConfigError(f"{one_line(error)}{hint}") from None
+        raise ConfigError(f"{one_line(error)}{hint}") from error
     except ValueError:  # too many digits for Python
         raise ConfigError("an integer has more than 64 bits") from None
     _check_extent(table)
@@ -99,19 +100,20 @@ def builtin_names() -> list[str]:
     return toml_names(builtin_folder())
 
 
-def toml_names(folder: Traversable) -> list[str]:
-    """Return the names of the TOML files in a package's folder, without `.toml`."""
-    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+def toml_names(folder: Traversable, suffix: str = ".toml") -> list[str]:
+    """Return the names of the TOML files in a package's folder, or of files with another suffix, without that."""
+    return sorted(entry.name.removesuffix(suffix) for entry in folder.iterdir() if entry.name.endswith(suffix))
 
 
-def find_toml(kind: str, name_or_file: str, folder: Traversable) -> Path:
+def find_named(kind: str, name_or_file: str, folder: Traversable, suffix: str = ".toml") -> Path:
     """Return the file of a built-in name in `folder`, or the given path; a path with a suffix may be missing.
 
-    Raises ConfigError for any other name, with the nearest built-in one. kind: of the file, for the error.
+    Raises ConfigError for any other name, with the nearest built-in one. kind: of the file, for the error. suffix: of
+    the files in the folder.
     """
-    names = toml_names(folder)
+    names = toml_names(folder, suffix)
     if name_or_file in names:
-        return Path(str(folder / f"{name_or_file}.toml"))
+        return Path(str(folder / f"{name_or_file}{suffix}"))
     path = Path(name_or_file)
     if not name_or_file or (not path.suffix and not exists(path)):
         nearest = nearest_name(name_or_file, names)

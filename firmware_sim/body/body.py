@@ -282,9 +282,6 @@ class Body:
         self._course["encoder_rad"] = self._course["estimate_rad"] = encoder_rad
         settle_transducer(numbers["transducer"], state["transducer"], *self._arm["tau_J"], *self._arm["temperature_C"])
 
-    compiled_functions = (advance_body, sample_body, fill_truth)
-    """The largest that are compiled with the first body."""
-
     def _compile(self) -> None:
         """Call every compiled function once, on a copy of the state, so that none is compiled during a run."""
         parts = self.parts._replace(state=self.parts.state.copy(), touch_state=self.parts.touch_state.copy())

@@ -12,7 +12,6 @@ from typing import Any, NoReturn, get_args
 import click
 
 from adacd_hil.clock import MonotonicClock, wall_ns
-from adacd_hil.compiled import compiling
 from adacd_hil.error_texts import error_text
 from adacd_hil.file_replacement import removing_empty_folders
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
@@ -37,7 +36,6 @@ from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.bench.injector import Departure
 from firmware_sim.bench.recorded_bench import RecordedBench, RecordedCycles
-from firmware_sim.body.body import Body
 from firmware_sim.canopen.object_dictionary import CONTRACTS, EmulatedContract
 from firmware_sim.canopen.pdo_record import LAST_NODE
 from firmware_sim.cli.own_devices import rehearse
@@ -174,7 +172,7 @@ def run(
             log = TruthLog(out / TRUTH_NAME, blocking=clock_mode == "sync", metadata=metadata, scenario=resolved)
             stack.enter_context(log)
         departure = Departure(bus)
-        with Progress(), compiling(Body.compiled_functions):
+        with Progress():
             bench = Bench(
                 resolved,
                 codec,

@@ -37,7 +37,7 @@ import numpy as np
 from adacd_hil.records import FaultReason, Vector
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError, setting
-from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
+from adacd_hil.settings.toml_files import find_named, read_toml, toml_names
 from firmware_sim.arm.arms import ARMS, EmulatedArm
 from firmware_sim.arm.hardware_settings import (
     DriveSettings,
@@ -351,7 +351,7 @@ def read_table(name_or_file: str) -> dict[str, Any]:
 
 
 def _read(kind: str, name_or_file: str) -> dict[str, Any]:
-    path = find_toml(kind, name_or_file, _FOLDER / f"{kind}s")
+    path = find_named(kind, name_or_file, _FOLDER / f"{kind}s")
     table = read_toml(path, kind)
     table.setdefault("name", path.stem)
     return table

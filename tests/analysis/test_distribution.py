@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adacd_hil.score.distribution import Distribution, low_percentiles, percentiles
+from adacd_hil.score.distribution import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES, PERCENTILES, Distribution
 
 FINEST = 2.0**-12
 
@@ -15,6 +15,15 @@ def distribution_of(values, exact, pieces=7):
     for part in np.array_split(values, pieces):
         found.add_values(part)
     return found
+
+
+def percentiles(values):
+    """Give numpy's percentiles by name."""
+    return dict(zip(PERCENTILE_NAMES, np.percentile(values, PERCENTILES, method="higher"), strict=True))
+
+
+def low_percentiles(values):
+    return dict(zip(LOW_PERCENTILE_NAMES, -np.percentile(-values, PERCENTILES, method="higher"), strict=True))
 
 
 def values_of(seed, count):

@@ -128,7 +128,7 @@ def test_limits_that_no_motion_keeps_are_said_in_a_line():
 
 
 def test_the_command_writes_a_configuration_with_what_it_found(tmp_path):
-    config, out = tmp_path / "small.toml", tmp_path / "found" / "mine.toml"
+    config, out = tmp_path / "small \U0001f9be.toml", tmp_path / "found" / "mine.toml"
     small = "period_s = 2.4\ncosine = [[-0.04, 0.01], [-0.04, 0.01]]\nsine = [[0.0, 0.0], [0.0, 0.0]]\n"
     config.write_text(f"extends = 'certified'\n[certified]\nlearn_every = 20\n[excitation]\n{small}")
     words = ["excitation", "--config", str(config), "--seconds", "0", "--out", str(out), "--json"]

@@ -492,6 +492,19 @@ def test_tune_says_that_so_little_motion_shows_nothing(log, tmp_path):
     assert found["logs"][0]["contacts"] == 1
 
 
+def test_a_suggestion_in_any_folder_extends_the_given_file_whatever_its_name(log, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    name = 'a "\x7f\n\U0001f9be.toml'
+    Path(name).write_text("[filter]\nb_rad_s = 30.0\n")
+    monkeypatch.setattr(
+        "adacd_hil.lab.tune.tune.tune", lambda *_: tuning_of(candidate(changes={"filter.a_rad_s": "20"}))
+    )
+    done = tune(log, "--config", name, "--out", "below/tuned.toml", "--json")
+    assert done.exit_code == 3, done.output
+    made = load_settings("below/tuned.toml").filter
+    assert (made.a_rad_s, made.b_rad_s) == (20.0, 30.0)
+
+
 def test_without_truth_only_thresholds_are_looked_for(log, tmp_path):
     shutil.copy(log, tmp_path / "run.mcap")
     done = tune(tmp_path)

@@ -14,6 +14,7 @@ from adacd_hil.settings.setting_keys import (
     parse_changes,
     parse_variations,
     split_list,
+    value_of,
 )
 
 PAPER = load_settings("paper")
@@ -41,6 +42,25 @@ def test_a_list_a_number_a_quoted_and_a_bare_word_are_taken():
 
 
 @pytest.mark.parametrize(
+    ("key", "value", "taken"),
+    [
+        ("detector.threshold_Nm", "0.3", (0.3, 0.3)),
+        ("certified.prior_std", "0.3", (0.3,) * 7),
+        ("certified.friction_terms", "stribeck", ("stribeck",)),
+        ("safety.tolerated_emergencies", "0x8210", (0x8210,)),
+        ("assumed", "arm.sign", ("arm.sign",)),
+    ],
+)
+def test_a_single_value_fills_a_list_whose_length_is_fixed_and_is_any_other_list_alone(key, value, taken):
+    assert value_of(apply_settings(PAPER, {key: value}), key) == taken
+
+
+def test_a_single_number_is_not_lost_in_an_empty_list():
+    with pytest.raises(ConfigError, match=r"`arm\.cad_theta` has 1 values, 7 expected"):
+        apply_settings(apply_settings(PAPER, {"arm.cad_theta": "[]"}), {"arm.cad_theta": "0.1"})
+
+
+@pytest.mark.parametrize(
     ("key", "value", "line"),
     [
         ("detector.treshold_Nm", "0.1", "unknown key `detector.treshold_Nm`; did you mean `detector.threshold_Nm`?"),
@@ -48,6 +68,7 @@ def test_a_list_a_number_a_quoted_and_a_bare_word_are_taken():
         ("filter.a_rad_s", "-1", "`filter.a_rad_s` = -1.0 rad/s is below 0.1 rad/s"),
         ("filter.a_rad_s", "fast", "`filter.a_rad_s` = 'fast' must be of type float"),
         ("filter.a_rad_s", "[1", "`filter.a_rad_s` = [1 is not a TOML value"),
+        ("arm.sign", "5000000000000000000000", "`arm.sign` is an integer of more than 64 bits"),
         ("detector.threshold_Nm", "[0.1]", "`detector.threshold_Nm` has 1 values, 2 expected"),
     ],
 )

@@ -163,7 +163,7 @@ def test_a_signal_before_a_host_ends_it_with_exit_code_0_and_leaves_nothing(tmp_
     try:
         assert process.stderr is not None
         while (line := process.stderr.readline()) != "ready\n":
-            assert line.startswith("compiling ")
+            assert line.startswith("compiling,")
         process.send_signal(number)
         out, err = process.communicate(timeout=HANG_S)
     finally:

@@ -10,13 +10,13 @@ from adacd_hil.cli.output import (
     CommandError,
     ExitCode,
     answer,
-    counted,
     explain_statuses,
     explained,
     format_table,
     text_of,
 )
 from adacd_hil.given_path import CommandGroup
+from adacd_hil.printable import number_of
 
 if TYPE_CHECKING:
     from adacd_hil.settings.setting_keys import KnownKey
@@ -106,7 +106,7 @@ def check(names: tuple[str, ...], profile: str | None, as_json: bool) -> ExitCod
     for name, found in findings.items():
         lines += [f"{name}: error: {line}" for line in found.errors]
         lines += [f"{name}: warning: {line}" for line in found.warnings]
-        lines.append(f"{name}: {counted(len(found.errors), 'error')}, {counted(len(found.warnings), 'warning')}")
+        lines.append(f"{name}: {number_of(len(found.errors), 'error')}, {number_of(len(found.warnings), 'warning')}")
     answer(as_json, described, text_of(lines))
     return ExitCode.USAGE if any(found.errors for found in findings.values()) else ExitCode.OK
 

@@ -20,7 +20,6 @@ from adacd_hil.cli.output import (
     ExitCode,
     answer,
     complain_of,
-    counted,
     explain_statuses,
     explained,
     format_table,
@@ -29,7 +28,7 @@ from adacd_hil.cli.output import (
 from adacd_hil.given_path import GIVEN_FILE, GivenPath
 from adacd_hil.log.log_files import SHOWN, SUFFIX
 from adacd_hil.log.log_parts import log_in
-from adacd_hil.printable import in_line
+from adacd_hil.printable import in_line, number_of
 from adacd_hil.progress_lines import Progress
 
 if TYPE_CHECKING:
@@ -164,7 +163,7 @@ def _replay_one(
     variants = {_name(choice): apply_settings(base, choice) for choice in choices}
     if not variants and base != own:
         variants = {", ".join(filter(None, [config or "", *changes])): base}
-    progress(f"replaying {given}" + (f" with {counted(len(variants), 'other setting')}" if variants else ""))
+    progress(f"replaying {given}" + (f" with {number_of(len(variants), 'other setting')}" if variants else ""))
     remarks: list[str] = []
     truth = contacts_beside(log_in(against or given), remarks.append)
     settings: list[Settings] = [own, *variants.values()]

@@ -35,7 +35,7 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.viewer_layout import viewer_files
-from adacd_hil.printable import in_line, one_line
+from adacd_hil.printable import in_line, number_of, one_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.records import FaultReason
 from adacd_hil.scheme.identify.anchor import unanchored_joints
@@ -247,7 +247,7 @@ def _verdict(result: dict[str, Any]) -> str:
     """Return a sentence on how a run ended: not started, broken off, by a fault, or without one."""
     if "broke_off" in result:
         certified = len(result["certificates"])
-        known = f" and {certified} certificate{'s' * (certified > 1)}" if certified else ""
+        known = f" and {number_of(certified, 'certificate')}" if certified else ""
         return f"The run broke off {result['broke_off']}{known}. The drives are disabled as far as the bus carried it."
     if "cycles" not in result:
         return "The run did not start."

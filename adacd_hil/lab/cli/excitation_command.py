@@ -1,6 +1,5 @@
 """The search for an excitation: the command's work and its table."""
 
-import json
 from typing import Any
 
 from adacd_hil.cli.output import CommandError, extendable, format_table
@@ -9,7 +8,7 @@ from adacd_hil.lab.tune.excitation_search import NoExcitationError, Search
 from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import ExcitationSettings
-from adacd_hil.settings.toml_text import to_toml
+from adacd_hil.settings.toml_text import to_toml, toml_value
 
 _LABELS = (
     ("excitation_Nm2s", "smallest eigenvalue, Nm² s", "{:.3g}"),
@@ -49,7 +48,7 @@ def search(config: str, profile: str | None, seconds: float, seed: int) -> dict[
 
 def as_toml(config: str, excitation: ExcitationSettings) -> str:
     """Return an excitation as the TOML text of a configuration that extends `config`, a name or file."""
-    return f"extends = {json.dumps(extendable(config))}\n\n[excitation]\n{to_toml(excitation)}"
+    return f"extends = {toml_value(extendable(config))}\n\n[excitation]\n{to_toml(excitation)}"
 
 
 def as_text(outcome: dict[str, Any]) -> str:

@@ -16,7 +16,6 @@ from adacd_hil.cli.output import (
     CommandError,
     ExitCode,
     answer,
-    counted,
     explain_statuses,
     explained,
     format_table,
@@ -24,7 +23,7 @@ from adacd_hil.cli.output import (
 from adacd_hil.given_path import WRITTEN_FILE, GivenPath
 from adacd_hil.lab.stated_bounds import MEANT_SHARE, STATUSES, THRESHOLD_SHARE
 from adacd_hil.log.log_files import LOG_NAME, LogError
-from adacd_hil.printable import in_line
+from adacd_hil.printable import in_line, number_of
 from adacd_hil.progress_lines import Progress
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.toml_files import toml_names
@@ -216,7 +215,7 @@ def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progre
         with_any_verdict = dataclasses.replace(asked, statuses=())
         found = [run for run in found if with_any_verdict.takes(run)]
         if waiting := sum(run.status == NOT_JUDGED for run in found):
-            progress(f"reading {counted(waiting, 'log')} without a report; `adacd-hil report` keeps the figures")
+            progress(f"reading {number_of(waiting, 'log')} without a report; `adacd-hil report` keeps the figures")
         found = [judged(run) for run in found]
     return [run for run in run_table.in_order(found) if asked.takes(run)]
 
@@ -254,7 +253,7 @@ def _trend_text(made: "Trend") -> str:
     from adacd_hil.lab.runs.run_table import HEAD, NUMBERS, row_texts
 
     left = f", {len(made.left_out)} left out" if made.left_out else ""
-    lines = [in_line(line) for line in (f"{made.arm}: {counted(len(made.runs), 'run')}{left}", made.sentence)]
+    lines = [in_line(line) for line in (f"{made.arm}: {number_of(len(made.runs), 'run')}{left}", made.sentence)]
     lines += [in_line(line) for line in (*made.further, made.assumed) if line]
     lines += [in_line(f"left out: {run.name}: {run.status}: {run.verdict}") for run in made.left_out]
     if made.runs:

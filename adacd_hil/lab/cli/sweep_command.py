@@ -11,10 +11,11 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_scenario, complete_setting
 from adacd_hil.cli.options import json_option, profile_option
-from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explain_statuses, explained, text_of
+from adacd_hil.cli.output import CommandError, ExitCode, answer, explain_statuses, explained, text_of
 from adacd_hil.clock import LOCKSTEP
 from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FOLDER, GivenPath
 from adacd_hil.log.log_files import LOG_NAME, SHOWN
+from adacd_hil.printable import number_of
 from adacd_hil.progress_lines import Progress
 
 if TYPE_CHECKING:
@@ -104,8 +105,8 @@ def sweep(
     work = replay_task if logs else simulate_task
     with Progress() as progress:
         progress(
-            f"{counted(plan.size, 'row')}: {counted(len(plan.subjects), 'log' if logs else 'run')} × "
-            f"{counted(len(plan.variants), 'setting')}"
+            f"{number_of(plan.size, 'row')}: {number_of(len(plan.subjects), 'log' if logs else 'run')} × "
+            f"{number_of(len(plan.variants), 'setting')}"
         )
         if scheduler and not scheduler.startswith(TLS) and not any(tls.values()):
             progress(

@@ -27,9 +27,9 @@ from adacd_hil.lab.offline.recording_verdict import Verdict
 from adacd_hil.lab.serial_arm.urdf import STANDARD_GRAVITY_M_S2, SerialArm, read_urdf
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.robot_description import robot_description
+from adacd_hil.printable import number_of
 from adacd_hil.records import Vector
 from adacd_hil.remedies import hint
-from adacd_hil.score.wording import number_of
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
@@ -351,12 +351,10 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
 
 def _check_lag(velocity_lag_s: Any, has_dq: bool) -> None:
     """Raise ArrayError if a lag is no number, outside its range, or not 0 without velocities."""
-    if not isinstance(velocity_lag_s, int | float | np.number):
-        raise ArrayError(f"velocity_lag_s = {velocity_lag_s!r} is no time in s")
-    if not 0.0 <= velocity_lag_s <= _LONGEST_LAG_S:
-        raise ArrayError(f"velocity_lag_s = {velocity_lag_s:g} s is not within 0 to {_LONGEST_LAG_S:g} s")
-    if velocity_lag_s and not has_dq:
-        raise ArrayError(f"velocity_lag_s = {velocity_lag_s:g} s is of dq, which is not given: derived, it has no lag")
+    longest_s = _LONGEST_LAG_S if has_dq else 0.0
+    if not isinstance(velocity_lag_s, int | float | np.number) or not 0.0 <= velocity_lag_s <= longest_s:
+        missing = "" if has_dq else ", as dq is not given"
+        raise ArrayError(f"velocity_lag_s = {velocity_lag_s!r} is no time within 0 to {longest_s:g} s{missing}")
 
 
 def _numbers(name: str, given: ArrayLike) -> Vector:
@@ -383,23 +381,20 @@ def _numbers(name: str, given: ArrayLike) -> Vector:
 def _span(recording: ForeignRecording, fit_s: tuple[float, float] | None) -> tuple[float, float]:
     """Return begin and end of the free motion, s since the first row; by default of the first `FIT_SHARE` of the time.
 
-    fit_s: in the arrays' time. Raises ArrayError if it is no pair of times, doesn't end after it begins, or ends more
-    than two periods after the last sample. It may begin before the first.
+    fit_s: in the arrays' time. Raises ArrayError if it is no pair of growing times, or ends more than two periods after
+    the last sample. It may begin before the first.
     """
     last = recording.stretches[-1]
     length_s = last.start_s + len(last.record.q) * recording.period_s
     if fit_s is None:
         return 0.0, FIT_SHARE * length_s
+    begin_s = recording.columns.begin_s
     try:
-        start_s, end_s = (float(bound) - recording.columns.begin_s for bound in fit_s)
+        start_s, end_s = (float(bound) - begin_s for bound in fit_s)
     except (TypeError, ValueError):
         start_s = end_s = math.nan
-    if math.isnan(start_s) or math.isnan(end_s):
-        raise ArrayError(f"fit_s = {fit_s!r} is no pair of times in s")
-    if not start_s < end_s:
-        raise ArrayError(f"fit_s = ({float(fit_s[0]):g}, {float(fit_s[1]):g}) s ends before it begins")
-    if end_s > length_s + recording.period_s:
-        raise ArrayError(f"fit_s ends at {float(fit_s[1]):g} s, t at {recording.columns.begin_s + length_s:g} s")
+    if not start_s < end_s <= length_s + recording.period_s:
+        raise ArrayError(f"fit_s = {fit_s!r} must be two growing times, s, up to {begin_s + length_s:g}, the end of t")
     return start_s, end_s
 
 

@@ -19,9 +19,9 @@ from adacd_hil.log.log_parts import log_in
 from adacd_hil.log.logged_run import settings_of
 from adacd_hil.log.reader import RunLog, each_once, read_log
 from adacd_hil.log.types.topics import CONTACT, CONTROL, CYCLE, EVENTS, SCHEME
+from adacd_hil.printable import number_of
 from adacd_hil.records import ContactReport, SchemeState, Vector
 from adacd_hil.remedies import hint
-from adacd_hil.score.wording import number_of
 from adacd_hil.settings.configuration import Settings
 
 if TYPE_CHECKING:

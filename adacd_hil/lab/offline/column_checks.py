@@ -16,8 +16,8 @@ from adacd_hil.lab.offline.recording_import import ForeignRecording, derivative_
 from adacd_hil.lab.offline.recording_map import ANGLE_RAD, RecordingMap, units_by_slope
 from adacd_hil.lab.serial_arm.urdf import SerialArm
 from adacd_hil.lab.signal_noise import white_noise
+from adacd_hil.printable import number_of
 from adacd_hil.records import Vector
-from adacd_hil.score.wording import number_of
 
 _MEASURED: Final = (("tau_J", "torque", "Nm"), ("q", "position", "rad"))
 """Key of `columns`, word and unit of the columns that every recording has."""

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from adacd_hil.lab.offline.recording_map import RecordingMap
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import TimeWindow
+from adacd_hil.printable import number_of
 from adacd_hil.records import Vector
-from adacd_hil.score.wording import number_of
 
 MOST_ROWS: Final = 4_000_000
 """Most rows of a file that are kept, and most samples made of them: an hour at 1 kHz, with a little to spare."""

@@ -22,9 +22,9 @@ from adacd_hil.lab.serial_arm.offline import Record
 from adacd_hil.lab.signal_noise import resolution, white_noise
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import TimeWindow
+from adacd_hil.printable import number_of
 from adacd_hil.records import Vector
 from adacd_hil.score.judge import contact_bounds
-from adacd_hil.score.wording import number_of
 
 SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-5, 0.05
 _LEAST_NOISE_NM = 1e-4

@@ -29,9 +29,9 @@ from adacd_hil.lab.score.verdict import headlines, is_good
 from adacd_hil.log.log_files import failing_as
 from adacd_hil.log.logged_run import Progress
 from adacd_hil.log.time_window import WHOLE, TimeWindow
-from adacd_hil.printable import in_line
+from adacd_hil.printable import in_line, number_of
 from adacd_hil.records import PARAMETER_UNITS
-from adacd_hil.score.wording import NONE, number_of, why_not_found
+from adacd_hil.score.wording import NONE, why_not_found
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import terminal_columns
 

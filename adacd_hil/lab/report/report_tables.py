@@ -28,10 +28,11 @@ from adacd_hil.lab.score.metrics import (
 from adacd_hil.lab.score.report_wording import number_text, pair_text, percent_text, rate_sentence, signed_text
 from adacd_hil.lab.score.run_arrays import QUANTITIES, Quantity, Run
 from adacd_hil.lab.score.verdict import BETA, CAD_BY_SECTION, FILTERS, FROZEN_BY_SECTION, HOLD, SMALLEST_MARGIN
+from adacd_hil.printable import number_of
 from adacd_hil.records import PARAMETER_UNITS
 from adacd_hil.score.distribution import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES
 from adacd_hil.score.smallest_push import PUSH_WITHIN
-from adacd_hil.score.wording import NONE, number_of
+from adacd_hil.score.wording import NONE
 
 _PLAIN_NAMES: Final = {
     FROZEN_BY_SECTION[0]: "Largest unexplained torque, first detection section",

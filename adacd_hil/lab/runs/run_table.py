@@ -19,6 +19,7 @@ from adacd_hil.lab.logs.signal_tables import import_pyarrow
 from adacd_hil.lab.runs.run_summary import CERTIFIED, GOOD, NO_CERTIFICATE, NOT_JUDGED, RUNNING, RunSummary
 from adacd_hil.lab.score.report_wording import number_text, pair_text
 from adacd_hil.log.log_files import failing_as
+from adacd_hil.printable import number_of
 from adacd_hil.score.wording import NONE, found_text
 
 _PAIR: Final = ("float64", "float64")
@@ -108,7 +109,7 @@ def count_text(runs: Sequence[RunSummary]) -> str:
 
     Broken runs count as not good. Counts of 0 are left out.
     """
-    text = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
+    text = number_of(len(runs), "run")
     bad = sum(run.status not in (GOOD, NOT_JUDGED, RUNNING) for run in runs)
     parts = [f"{bad} not good"] if bad else []
     for status in (NOT_JUDGED, RUNNING):

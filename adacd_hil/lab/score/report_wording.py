@@ -7,9 +7,10 @@ from typing import Final
 import numpy as np
 
 from adacd_hil.lab.score.rates import CONFIDENCE_TEXT
+from adacd_hil.printable import number_of
 from adacd_hil.records import SchemeState
 from adacd_hil.score.judge import Score
-from adacd_hil.score.wording import NONE, number_of
+from adacd_hil.score.wording import NONE
 
 _MORE_DIGITS: Final = 3
 

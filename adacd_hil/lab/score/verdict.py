@@ -27,10 +27,11 @@ from adacd_hil.lab.score.run_arrays import EMULATOR, Run, Section
 from adacd_hil.lab.score.run_faults import Break
 from adacd_hil.lab.score.run_judge import uncovered_watch
 from adacd_hil.log.logged_run import is_armed_in
+from adacd_hil.printable import number_of
 from adacd_hil.records import JOINTS
 from adacd_hil.score.judge import Score
 from adacd_hil.score.smallest_push import PUSH_WITHIN
-from adacd_hil.score.wording import NONE, found_text, number_of
+from adacd_hil.score.wording import NONE, found_text
 from adacd_hil.settings.arm_settings import ArmSettings
 from adacd_hil.settings.configuration_files import load_settings
 

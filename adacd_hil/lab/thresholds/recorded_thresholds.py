@@ -45,9 +45,9 @@ from adacd_hil.lab.thresholds.free_motion import (
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Milestones, Progress
 from adacd_hil.log.time_window import TimeWindow
+from adacd_hil.printable import number_of
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.model.regressor import mass_matrix
-from adacd_hil.score.wording import number_of
 
 _LONGEST_LAG_S: Final = 5e-3
 _MODEL_RAD_S: Final = 20.0

@@ -12,7 +12,6 @@ show the share of contacts found against false alarms, and the delays.
 """
 
 import itertools
-import json
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -52,14 +51,16 @@ from adacd_hil.lab.tune.tune_roc import (
 )
 from adacd_hil.log.logged_run import Progress
 from adacd_hil.log.time_window import TimeWindow
+from adacd_hil.printable import number_of
 from adacd_hil.replay.replay import replay_many
 from adacd_hil.replay.replayed_outcome import Replay
-from adacd_hil.score.wording import found_text, number_of
+from adacd_hil.score.wording import found_text
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import apply_settings, changed_keys, keep_log_settings
 from adacd_hil.settings.toml_files import builtin_names
+from adacd_hil.settings.toml_text import toml_value
 
 FARTHEST: Final = 100.0
 """Extrapolation beyond which filters and gains are not ranked: thresholds of equal ones differ by a factor of 4."""
@@ -235,11 +236,11 @@ def suggested_toml(tuning: Tuning, best: Candidate, base_name: str, base: Settin
     differing = [key for key in changed_keys(keep_log_settings(own, base), own) if key != "name"]
     lines = [*_provenance(tuning, best)]
     if differing:
-        lines.append(f"the logs' settings differ from {base_name} in {', '.join(differing)}")
-    text = [*(f"# {line}" for line in lines), "", f"extends = {json.dumps(base_name, ensure_ascii=False)}"]
+        lines.append(f"the logs' settings differ from {_plain(base_name)} in {', '.join(differing)}")
+    text = [*(f"# {line}" for line in lines), "", f"extends = {toml_value(base_name)}"]
     sections: dict[str, list[str]] = {}
     if own.arm.profile != load_settings(base_name).arm.profile:
-        sections["arm"] = [f"profile = {json.dumps(own.arm.profile)}"]
+        sections["arm"] = [f"profile = {toml_value(own.arm.profile)}"]
     for key, (_, value) in changed_keys(base, apply_settings(base, best.changes)).items():
         section, _, last = key.rpartition(".")
         sections.setdefault(section, []).append(f"{last} = {value}")
@@ -255,7 +256,7 @@ def _provenance(tuning: Tuning, best: Candidate) -> list[str]:
     lines = [
         f"Suggested by adacd-hil tune, version {__version__}, {date}.",
         f"From {len(tuning.logs)} logs, {sum(map(free_hours, tuning.logs)):.4f} h of motion that nobody touched:",
-        *(f"  {_plain(log.path)}, SHA-256 {log.digest}, {free_hours(log):.4f} h" for log in tuning.logs),
+        *(f"  {_plain(str(log.path))}, SHA-256 {log.digest}, {free_hours(log):.4f} h" for log in tuning.logs),
         f"Wanted: {tuning.rate_per_h:g} false alarms per hour. Thresholds: {choice.method}, whose upper "
         f"{CONFIDENCE_TEXT} bound is the wanted rate.",
     ]
@@ -271,9 +272,9 @@ def _provenance(tuning: Tuning, best: Candidate) -> list[str]:
     return lines
 
 
-def _plain(path: Path) -> str:
-    """Return a path as text, with "?" in place of letters that aren't printable, which might end a comment."""
-    return "".join(letter if letter.isprintable() else "?" for letter in str(path))
+def _plain(name: str) -> str:
+    """Return a text with "?" in place of letters that aren't printable, which might end a comment."""
+    return "".join(letter if letter.isprintable() else "?" for letter in name)
 
 
 def in_words(found: Found) -> str:

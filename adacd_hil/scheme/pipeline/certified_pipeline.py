@@ -62,14 +62,6 @@ class CertifiedPipeline(Pipeline):
         self._watch = CertificateWatch(self._k, self._m, settings.history.date_utc)
         self._doubt = Doubt(settings, self._k, self._m)
 
-    compiled_functions = (
-        certified_kernel.begin_adaptation,
-        certified_kernel.begin_test,
-        certified_kernel.begin_refinement,
-        paper_kernel.begin_adaptation,
-        certified_cycle,
-    )
-
     def compile_cycle(self) -> None:
         """Compile each function of the cycle by a call on copies, so that no later cycle compiles."""
         constants, memory = self.numbers.constants, self.numbers.memory.copy()

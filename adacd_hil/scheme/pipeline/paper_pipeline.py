@@ -24,7 +24,6 @@ class PaperPipeline(Pipeline):
     """
 
     _cycle, _end, _run = staticmethod(paper_cycle), staticmethod(end_paper), staticmethod(run_paper)
-    compiled_functions = (paper_kernel.begin_adaptation, paper_cycle)
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings, paper_kernel.numbers_of(settings))

@@ -84,8 +84,6 @@ class Pipeline(ABC):
     """
 
     tau_ext_hat: Vector
-    compiled_functions: tuple[object, ...]
-    """The largest compiled functions that `compile_cycle` runs."""
     _cycle: Callable[..., int]
     _end: Callable[..., int]
     _run: Callable[..., tuple[int, int]]
