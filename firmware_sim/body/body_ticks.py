@@ -185,10 +185,11 @@ def _measure_tick(state: np.void, numbers: np.void, encoder_noise: NDArray[np.fl
         for joint in range(2):
             heat_motor(motor, state["motor"], joint, arm["tau_m"][joint])
     if numbers["transducer"]["has_memory"] != 0.0:
-        tau_J, temperature_C = arm["tau_J"], arm["temperature_C"]
-        sense_torque(
-            numbers["transducer"], state["transducer"], tick, tau_J[0], tau_J[1], temperature_C[0], temperature_C[1]
-        )
+        for joint in range(2):
+            tau_Nm, other_Nm = arm["tau_J"][joint], arm["tau_J"][1 - joint]
+            sense_torque(
+                numbers["transducer"], state["transducer"], joint, tick, tau_Nm, other_Nm, arm["temperature_C"][joint]
+            )
 
 
 @compiled
