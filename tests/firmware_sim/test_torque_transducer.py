@@ -77,13 +77,13 @@ def test_a_warm_joint_shifts_the_zero_and_the_sensitivity():
 
 def test_the_zero_drifts_at_its_slope_from_power_on():
     body = Body(parse(Scenario, {"noise": False, "sensors": {"offset_drift_Nm_s": [0.5, -2.0]}}))
-    measured = [body.sample().tau_J]
+    measured = [body.sample().torque_counts]
     for _ in range(10):
         body.advance((0.0, 0.0), OFF, 1000)
-        measured.append(body.sample().tau_J)
-    slopes = np.polyfit(np.arange(11) * 0.1, np.array(measured), 1)[0]
+        measured.append(body.sample().torque_counts)
+    slopes = np.polyfit(np.arange(11) * 0.1, np.array(measured) * TORQUE_LSB_NM, 1)[0]
     assert slopes == pytest.approx([0.5, -2.0], abs=2e-3)
-    assert measured[0].tolist() == [0.0, 0.0]
+    assert measured[0] == (0, 0)
 
 
 @pytest.mark.parametrize("is_regular", [True, False])
