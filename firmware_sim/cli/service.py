@@ -3,7 +3,6 @@
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 from adacd_hil.clock import Clock
 from adacd_hil.records import JOINTS
@@ -15,7 +14,6 @@ from adacd_hil.wire.time_marks import HOST_MARK, NEVER_NS
 from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.bench.bench_time import LONGEST_ORPHANAGE_NS
 from firmware_sim.bench.injector import Departure
-from firmware_sim.canopen.object_dictionary import is_fd
 from firmware_sim.canopen.pdo_record import LISTENED_IDS
 
 _IDLE_NS = 10_000_000  # without SYNC for this long, timers go by the clock: heartbeats before and between runs
@@ -194,5 +192,4 @@ def open_devices_end(interface: str, channel: str, clock: Clock, codec: Codec) -
     """
     heard = {message.can_id for message in codec.messages.values() if "HOST" in message.senders} | LISTENED_IDS
     heard.add(HOST_MARK)
-    options: dict[str, Any] = {"is_fd": True} if is_fd(codec) else {}
-    return open_bus(interface, channel, clock, sorted(heard), **options)
+    return open_bus(interface, channel, clock, sorted(heard), is_fd=codec.is_fd)
