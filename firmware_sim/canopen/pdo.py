@@ -190,13 +190,6 @@ class ReceivePdo(PdoRecord):
         if self.type in EVENT_DRIVEN:
             self._pdos.act_at_once(self, self._pdos.own_ns(t_ns))
 
-    def is_late(self, t_ns: int) -> bool:
-        """Return whether the last frame acted at least an event timer ago; t_ns: on the device's clock.
-
-        False without a timer, or before the first frame.
-        """
-        return self.timer_ns > 0 and self.acted_ns is not None and t_ns - self.acted_ns >= self.timer_ns
-
 
 class Pdos:
     """All PDOs of one device."""
@@ -242,8 +235,6 @@ class Pdos:
         """Identifiers of the frames that follow every SYNC."""
         self._asynchronous: tuple[TransmitPdo, ...] = ()
         self._compared: tuple[TransmitPdo, ...] = ()
-        self.has_compared = False
-        """Whether the events of an active PDO of type 254 or 255 are the changes of its content."""
         self._receiving: tuple[ReceivePdo, ...] = ()
         self._waiting: tuple[ReceivePdo, ...] = ()
         self._sending: frozenset[TransmitPdo] = frozenset()
@@ -310,7 +301,6 @@ class Pdos:
         self.on_sync = tuple(pdo.send if pdo.type == 1 else pdo.on_sync for pdo in sending if pdo.is_synchronous)
         self._asynchronous = tuple(pdo for pdo in sending if not pdo.is_synchronous)
         self._compared = tuple(pdo for pdo in self._asynchronous if pdo.is_compared)
-        self.has_compared = bool(self._compared)
         self._waiting = tuple(pdo for pdo in self._receiving if pdo.is_synchronous)
         self._find_commands()
         self.on_refresh()
@@ -360,16 +350,9 @@ class Pdos:
                 is_commanded = is_commanded or pdo.is_command
         return is_commanded
 
-    def find_late(self, t_ns: int) -> bool:
-        """Return whether the last frame of some active RPDO acted at least its event timer ago.
-
-        t_ns: on the device's clock.
-        """
-        return any(pdo.is_late(t_ns) for pdo in self._receiving)
-
     @property
     def deadline_ns(self) -> int:
-        """Time on the device's clock at which the first RPDO gets late, ns.
+        """Time on the device's clock from which some active RPDO is late: its last frame acted an event timer ago, ns.
 
         It is NEVER_NS if no RPDO has an event timer and an earlier frame.
         """
