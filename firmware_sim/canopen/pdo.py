@@ -29,12 +29,13 @@ class TransmitPdo(PdoRecord):
 
     is_received = False
 
-    def __init__(self, pdos: "Pdos", index: int, message: MessageCodec | None) -> None:
-        super().__init__(pdos.dictionary, index, message, pdos.longest, pdos.message_ids, pdos.refresh)
+    def __init__(self, pdos: "Pdos", index: int, messages: Mapping[int, MessageCodec]) -> None:
+        super().__init__(pdos.dictionary, index, messages, pdos.longest, pdos.refresh)
         self._pdos = pdos
         self.is_due = False
         """Whether an event has happened that the bus hasn't seen."""
         self._reads: tuple[Callable[[], int], ...] = ()
+        message = self.message
         self._sender = None if message is None or not message.is_protected else message.sender()
         self.send: Callable[[], None] = lambda: None
         """Sends the present values."""
@@ -136,9 +137,10 @@ class ReceivePdo(PdoRecord):
 
     is_received = True
 
-    def __init__(self, pdos: "Pdos", index: int, message: MessageCodec | None) -> None:
-        super().__init__(pdos.dictionary, index, message, pdos.longest, pdos.message_ids, pdos.refresh)
+    def __init__(self, pdos: "Pdos", index: int, messages: Mapping[int, MessageCodec]) -> None:
+        super().__init__(pdos.dictionary, index, messages, pdos.longest, pdos.refresh)
         self._pdos = pdos
+        message = self.message
         self.receiver = None if message is None or not message.is_protected else message.receiver()
         """Checks the frames of the contract's message; None where that isn't protected."""
         self.acted_ns: int | None = None
@@ -209,8 +211,6 @@ class Pdos:
         self.dictionary = dictionary
         self.send = send
         self.longest = longest
-        self.message_ids = frozenset(messages)
-        """Identifiers of the contract, which the device hears besides those that any PDO may have."""
         self.act: Callable[[int], None] = lambda _t_ns: None
         """Called when a frame that doesn't wait for SYNC has been written."""
         self.mind_length: Callable[[bool, int], None] = lambda _is_right, _t_ns: None
@@ -238,8 +238,8 @@ class Pdos:
         self._receiving: tuple[ReceivePdo, ...] = ()
         self._waiting: tuple[ReceivePdo, ...] = ()
         self._sending: frozenset[TransmitPdo] = frozenset()
-        self.receive = tuple(ReceivePdo(self, i, _message(self, messages, i)) for i in _records(self, RECEIVE))
-        self.transmit = tuple(TransmitPdo(self, i, _message(self, messages, i)) for i in _records(self, TRANSMIT))
+        self.receive = tuple(ReceivePdo(self, i, messages) for i in _records(self, RECEIVE))
+        self.transmit = tuple(TransmitPdo(self, i, messages) for i in _records(self, TRANSMIT))
         dictionary.serve(0x2100, 1, lambda: self.header[0])
         dictionary.serve(0x2100, 2, lambda: self.header[1])
         dictionary.serve(0x2101, 1, lambda: int.from_bytes(self.header[:2], "little"))
@@ -390,11 +390,3 @@ class Pdos:
 
 def _records(pdos: Pdos, first: int) -> list[int]:
     return [index for index in range(first, first + COUNT) if pdos.dictionary.has(index, 1)]
-
-
-def _message(pdos: Pdos, messages: Mapping[int, MessageCodec], index: int) -> MessageCodec | None:
-    """Return the contract's message with a PDO's present COB-ID; None if the contract has none.
-
-    index: of the PDO's communication object, 0x1400 or 0x1800 on. Raises `Refusal` if the device lacks its COB-ID.
-    """
-    return messages.get(pdos.dictionary.value(index, 1) & 0x7FF)
