@@ -26,12 +26,7 @@ from typing import Final
 import numpy as np
 
 from adacd_hil.settings.schema import ConfigError, setting
-from firmware_sim.arm.plant import ARM_NUMBERS, CURRENT_LOOP_RAD_S
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, Measurement
-
-STOP_STIFFNESS_NM_RAD: Final = (3000.0, 1000.0)
-STOP_DAMPING_NM_S: Final = (10.0, 2.0)
-"""Of the joint stops, per rad/s."""
 
 
 def pack_fields(settings: object, layout: np.dtype[np.void]) -> np.void:
@@ -106,21 +101,6 @@ class EmulatedArm:
         beta = length1_m * (mass2_kg * center2_m)
         gamma = inertia2_kg_m2 + mass2_kg * center2_m**2
         return alpha, beta, gamma
-
-    def numbers(self) -> np.void:
-        """Return the arm without payload as one record of dtype ARM_NUMBERS, for compiled functions.
-
-        Joint stops are at ± `stop_deg`. Their stiffness and damping, and the current loops, have default values.
-        """
-        numbers = pack_fields(self, ARM_NUMBERS)
-        numbers["alpha"], numbers["beta"], numbers["gamma"] = self.inertia()
-        numbers["current_loop_rad_s"][:] = CURRENT_LOOP_RAD_S
-        numbers["stop_high_rad"][:] = np.radians(self.stop_deg)
-        numbers["stop_low_rad"][:] = -numbers["stop_high_rad"]
-        numbers["stop_stiffness_Nm_rad"][:] = STOP_STIFFNESS_NM_RAD
-        numbers["stop_damping_Nm_s"][:] = STOP_DAMPING_NM_S
-        numbers["moment_kg_m"] = self.mass_kg[0] * self.center_m[0] + self.mass_kg[1] * self.link_length_m[0]
-        return numbers
 
     @property
     def wiring(self) -> "Wiring":

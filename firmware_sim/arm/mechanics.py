@@ -48,7 +48,7 @@ from firmware_sim.arm.joint_forces import (
     set_drift,
     warm,
 )
-from firmware_sim.arm.plant import follow_target
+from firmware_sim.arm.plant import CURRENT_LOOP_RAD_S, follow_target
 
 # Rows of the work space; only the touch state has the last one.
 _START: Final = 0
@@ -185,9 +185,8 @@ def _runge_kutta(
     touch, mechanics = work.touch, around.mechanics
     start, stage, end = work.rows[_START], work.rows[_STAGE], work.rows[_END]
     half_s = 0.5 * step_s
-    loop_rad_s = around.arm["current_loop_rad_s"]
-    mid1, end1 = follow_target(start["tau_m"][0], target1, loop_rad_s[0] * step_s)
-    mid2, end2 = follow_target(start["tau_m"][1], target2, loop_rad_s[1] * step_s)
+    mid1, end1 = follow_target(start["tau_m"][0], target1, CURRENT_LOOP_RAD_S * step_s)
+    mid2, end2 = follow_target(start["tau_m"][1], target2, CURRENT_LOOP_RAD_S * step_s)
     stage["tau_m"][0], stage["tau_m"][1] = mid1, mid2
     for rates in (_K2, _K3, _K4):
         length_s = half_s

@@ -34,7 +34,7 @@ def test_accelerations_are_those_of_pinocchio(name, payload, tilt_deg):
         without_friction(name), MechanicsSettings(tilt_deg=tilt_deg, tilt_direction_deg=35.0), payload=payload
     )
     model = pinocchio_arm(arm.arm, payload, math.radians(tilt_deg), math.radians(35.0))
-    data, numbers = model.createData(), ARMS[name].numbers()
+    data, numbers = model.createData(), RIGID.arm_numbers(ARMS[name])
     generator = np.random.default_rng(3)
     for _ in range(100):
         q, dq, tau = generator.uniform(-3, 3, 2), generator.uniform(-6, 6, 2), generator.uniform(-12, 12, 2)
