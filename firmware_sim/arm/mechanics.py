@@ -319,11 +319,7 @@ def _load(around: Surroundings, touch_state: Vector, work: _StepWork) -> None:
 
 @compiled
 def integrate_mechanics(
-    state: np.void,
-    arm: np.void,
-    mechanics: np.void,
-    contact: Structured,
-    things: Structured,
+    around: Surroundings,
     touch_state: Vector,
     time_s: float,
     elapsed_s: float,
@@ -335,12 +331,11 @@ def integrate_mechanics(
 ) -> None:
     """Advance the mechanical state and the touch state by `step_s` in `substeps` substeps, in place.
 
-    Temperatures change once, at the end. contact: one row of the contact table, or empty; elapsed_s: since its onset.
-    things, touch_state: table and state of bodies, hands and walls for `firmware_sim.arm.touch_forces.touch`; time_s:
-    scenario time, negative before the scenario starts. target: set-points of the drives' torque loops, Nm. space: from
-    `work_space`, overwritten.
+    Temperatures change once, at the end. touch_state: of bodies, hands and walls, for
+    `firmware_sim.arm.touch_forces.touch`. time_s: scenario time, negative before the scenario starts. elapsed_s: since
+    the contact's onset. target: set-points of the drives' torque loops, Nm. space: from `work_space`, overwritten.
     """
-    around = Surroundings(state, arm, mechanics, contact, things)
+    state, mechanics = around.state, around.mechanics
     rows, forces = space[:_ROWS_END], space[_ROWS_END:_FORCES_END].view(FORCES)[0]
     work = _StepWork(rows.view(ROW), _matrix(rows), _matrix(space[_FORCES_END:]), forces)
     _load(around, touch_state, work)
@@ -409,15 +404,7 @@ def _warm(around: Surroundings, step_s: float, work: _StepWork) -> None:
 
 @compiled
 def observe(
-    state: np.void,
-    arm: np.void,
-    mechanics: np.void,
-    contact: Structured,
-    things: Structured,
-    touch_state: Vector,
-    time_s: float,
-    elapsed_s: float,
-    space: Vector,
+    around: Surroundings, touch_state: Vector, time_s: float, elapsed_s: float, space: Vector
 ) -> tuple[float, float, float, float, float, float]:
     """Return the present true values, Nm: external torque, friction along +dq, gravity torque, two joints each.
 
@@ -425,7 +412,6 @@ def observe(
     touch state stay; `rotor_kg_m2` of the state is set, `space` is overwritten. Arguments are as of
     `integrate_mechanics`.
     """
-    around = Surroundings(state, arm, mechanics, contact, things)
     rows, forces = space[:_ROWS_END], space[_ROWS_END:_FORCES_END].view(FORCES)[0]
     work = _StepWork(rows.view(ROW), _matrix(rows), _matrix(space[_FORCES_END:]), forces)
     _load(around, touch_state, work)
