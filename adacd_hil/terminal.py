@@ -2,7 +2,7 @@
 
 Text from files or the bus can't control a terminal: control characters are escaped as in JSON (`plain`). A reader
 that goes away, as `head` does, is no error. An output that blocks delays the end by half a second at most once the user
-has asked for it.
+has asked for it, by a signal.
 """
 
 import _thread
@@ -17,6 +17,7 @@ import stat
 import sys
 import textwrap
 import threading
+from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import TextIO
 
@@ -253,6 +254,39 @@ def hurry() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, Terminal):
             stream.hurry()
+
+
+@contextlib.contextmanager
+def handling(handler: Callable[..., object] | signal.Handlers, *numbers: signal.Signals) -> Iterator[None]:
+    """Handle these signals while the block runs; then restore their handlers."""
+    previous = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, before in previous.items():
+            signal.signal(number, before)
+
+
+@contextlib.contextmanager
+def on_interrupt(interrupt: Callable[[], None], *further: signal.Signals) -> Iterator[None]:
+    """Call a function on SIGINT, SIGTERM and SIGHUP while the block runs; then restore the handlers.
+
+    A signal also shortens the waits for a blocked output. further: signals that call the function, too. SIGHUP stays
+    ignored if it was. Outside the main thread, change nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handle(*_: object) -> None:
+        hurry()
+        interrupt()
+
+    numbers = [signal.SIGINT, signal.SIGTERM, *further]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # else it was started to outlive its terminal
+        numbers.append(signal.SIGHUP)
+    with handling(handle, *numbers):
+        yield
 
 
 def write_screen(text: str, stream: TextIO | None = None) -> None:

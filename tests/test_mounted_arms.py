@@ -6,13 +6,12 @@ from pathlib import Path
 import pytest
 from called import called
 from long_cases import long_but
-from played_outcome import outcome_of
+from played_outcome import ScenarioOutcome, outcome_of
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.replay.replay import replay
 from adacd_hil.settings.setting_keys import apply_settings
-from firmware_sim.scenario.scenario import ScenarioOutcome
 
 pytestmark = pytest.mark.slow
 

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import pytest
 from long_cases import long_but
-from played_outcome import outcome_of
+from played_outcome import deviations, expected_of, outcome_of
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.log.reader import read_log
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.toml_text import to_short_toml, to_toml
 from firmware_sim.scenario.faults import KINDS
-from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, deviations, load_scenario
+from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_scenario
 
 NAMES = builtin_scenarios()
 GROUPS = {"experiment", "people", "mechanics", "measurement", "faults", "minutes"}
@@ -78,7 +78,7 @@ def test_a_run_of_it_comes_to_what_it_expects(name: str, tmp_path: Path) -> None
 def test_a_certified_host_comes_to_what_is_expected_of_it(name: str, tmp_path: Path) -> None:
     cast = resolve("certified", name, None, None)
     outcome = outcome_of(*run_embedded(cast, "lockstep", tmp_path))
-    expected = cast.scenario.expected_of("certified")
+    expected = expected_of(cast.scenario, "certified")
     assert expected is not None
     assert expected != cast.scenario.expect
     assert deviations(expected, outcome) == ()

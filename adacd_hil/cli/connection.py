@@ -3,8 +3,7 @@
 import dataclasses
 import shlex
 import signal
-import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from adacd_hil.printable import in_line
 from adacd_hil.settings.arm_settings import MOST_BLIND_CYCLES
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.terminal import hurry
+from adacd_hil.terminal import handling
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError
 from adacd_hil.wire.can_interface import can_interfaces, is_virtual
 from adacd_hil.wire.codec import Codec
@@ -228,43 +227,10 @@ def raise_interrupt() -> NoReturn:
     raise KeyboardInterrupt
 
 
-@contextmanager
-def _handling(handler: Callable[..., object] | signal.Handlers, *numbers: signal.Signals) -> Iterator[None]:
-    """Handle these signals while the block runs; then restore their handlers."""
-    previous = {number: signal.signal(number, handler) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, before in previous.items():
-            signal.signal(number, before)
-
-
 def never_stopped() -> AbstractContextManager[None]:
     """Ignore SIGTTIN and SIGTTOU in the block, by which a terminal stops a background process that reads or writes it.
 
     A stopped process would send no commands to a moving arm. Reading such a terminal raises OSError instead. Restore
     the handlers after the block.
     """
-    return _handling(signal.SIG_IGN, signal.SIGTTIN, signal.SIGTTOU)
-
-
-@contextmanager
-def on_interrupt(interrupt: Callable[[], None], *further: signal.Signals) -> Iterator[None]:
-    """Call a function on SIGINT, SIGTERM and SIGHUP while the block runs; then restore the handlers.
-
-    A signal also shortens the waits for a blocked output. further: signals that call the function, too. SIGHUP stays
-    ignored if it was. Outside the main thread, change nothing.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def handle(*_: object) -> None:
-        hurry()
-        interrupt()
-
-    numbers = [signal.SIGINT, signal.SIGTERM, *further]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # else it was started to outlive its terminal
-        numbers.append(signal.SIGHUP)
-    with _handling(handle, *numbers):
-        yield
+    return handling(signal.SIG_IGN, signal.SIGTTIN, signal.SIGTTOU)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from adacd_hil.cli.connection import make_clock, model_time, on_interrupt
+from adacd_hil.cli.connection import make_clock, model_time
 from adacd_hil.clock import LOCKSTEP
 from adacd_hil.control.cycle_compilation import compiling_cycle
 from adacd_hil.control.operator import ScriptedOperator
@@ -24,6 +24,7 @@ from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import RequestSettings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_text import to_toml
+from adacd_hil.terminal import on_interrupt
 from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.bench.bench import Bench

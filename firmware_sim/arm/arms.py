@@ -25,14 +25,8 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.records import Vector
 from adacd_hil.settings.schema import ConfigError, setting
-from firmware_sim.arm.plant import ARM_NUMBERS, CURRENT_LOOP_RAD_S
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, Measurement
-
-STOP_STIFFNESS_NM_RAD: Final = (3000.0, 1000.0)
-STOP_DAMPING_NM_S: Final = (10.0, 2.0)
-"""Of the joint stops, per rad/s."""
 
 
 def pack_fields(settings: object, layout: np.dtype[np.void]) -> np.void:
@@ -99,35 +93,14 @@ class EmulatedArm:
             if 0 in getattr(self, key):
                 raise ConfigError(f"`own_arm.{key}` = {list(getattr(self, key))} must be +1 or -1 for each device")
 
-    def inertia(self, payload_kg: float = 0.0) -> tuple[float, float, float]:
-        """Return α, β, γ of the mass matrix, kg m², with a point mass `payload_kg` at the tip."""
-        (length1_m, length2_m), (mass1_kg, mass2_kg) = self.link_length_m, self.mass_kg
+    def inertia(self) -> tuple[float, float, float]:
+        """Return α, β, γ of the mass matrix, kg m², without payload."""
+        length1_m, (mass1_kg, mass2_kg) = self.link_length_m[0], self.mass_kg
         (center1_m, center2_m), (inertia1_kg_m2, inertia2_kg_m2) = self.center_m, self.inertia_kg_m2
-        alpha = inertia1_kg_m2 + mass1_kg * center1_m**2
-        alpha += (mass2_kg + payload_kg) * length1_m**2
-        beta = length1_m * (mass2_kg * center2_m + payload_kg * length2_m)
-        gamma = inertia2_kg_m2 + mass2_kg * center2_m**2 + payload_kg * length2_m**2
+        alpha = inertia1_kg_m2 + mass1_kg * center1_m**2 + mass2_kg * length1_m**2
+        beta = length1_m * (mass2_kg * center2_m)
+        gamma = inertia2_kg_m2 + mass2_kg * center2_m**2
         return alpha, beta, gamma
-
-    def theta(self, payload_kg: float = 0.0) -> Vector:
-        """Return the arm's parameters (7,) in the order of `records.PARAMETER_NAMES`, with `payload_kg` at the tip."""
-        alpha, beta, gamma = self.inertia(payload_kg)
-        return np.array([alpha + gamma, beta, gamma, *self.viscous_Nm_s, *self.coulomb_Nm])
-
-    def numbers(self) -> np.void:
-        """Return the arm without payload as one record of dtype ARM_NUMBERS, for compiled functions.
-
-        Joint stops are at ± `stop_deg`. Their stiffness and damping, and the current loops, have default values.
-        """
-        numbers = pack_fields(self, ARM_NUMBERS)
-        numbers["alpha"], numbers["beta"], numbers["gamma"] = self.inertia()
-        numbers["current_loop_rad_s"][:] = CURRENT_LOOP_RAD_S
-        numbers["stop_high_rad"][:] = np.radians(self.stop_deg)
-        numbers["stop_low_rad"][:] = -numbers["stop_high_rad"]
-        numbers["stop_stiffness_Nm_rad"][:] = STOP_STIFFNESS_NM_RAD
-        numbers["stop_damping_Nm_s"][:] = STOP_DAMPING_NM_S
-        numbers["moment_kg_m"] = self.mass_kg[0] * self.center_m[0] + self.mass_kg[1] * self.link_length_m[0]
-        return numbers
 
     @property
     def wiring(self) -> "Wiring":
@@ -183,12 +156,12 @@ class Wiring:
     torque_sign: direction of a drive's torque. zero_counts: position of each drive at q = 0, before `drive_sign`.
     """
 
-    drive_joint: Joints = (0, 1)
-    sensor_joint: Joints = (0, 1)
-    drive_sign: Joints = (1, 1)
-    sensor_sign: Joints = (1, 1)
-    torque_sign: Joints = (1, 1)
-    zero_counts: Joints = (0, 0)
+    drive_joint: Joints
+    sensor_joint: Joints
+    drive_sign: Joints
+    sensor_sign: Joints
+    torque_sign: Joints
+    zero_counts: Joints
 
     def read(self, measured: Measurement) -> Measurement:
         """Return a measurement by joint as pairs by device, (Drive1, Drive2) and (Sensor1, Sensor2), in counts.
@@ -204,6 +177,3 @@ class Wiring:
             (up1 * velocities[d1], up2 * velocities[d2]),
             (turn1 * torques[s1], turn2 * torques[s2]),
         )
-
-
-STRAIGHT = Wiring()

@@ -19,9 +19,9 @@ from typing import Final
 import numpy as np
 
 from adacd_hil.settings.schema import ConfigError, setting
-from firmware_sim.arm.arms import STOP_DAMPING_NM_S, STOP_STIFFNESS_NM_RAD, EmulatedArm, pack_fields
+from firmware_sim.arm.arms import EmulatedArm, pack_fields
 from firmware_sim.arm.joint_forces import MECHANICS_NUMBERS, REFERENCE_C
-from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, mass_matrix
+from firmware_sim.arm.plant import ARM_NUMBERS, MECHANICAL_STATE, fit_payload, mass_matrix
 from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM
 from firmware_sim.arm.touch_settings import TICK_S
 
@@ -107,10 +107,8 @@ class MechanicsSettings:
     stop_high_deg: Pair | None = setting(
         None, unit="deg", low=-720.0, high=720.0, meaning="upper joint stops; absent: the profile's"
     )
-    stop_stiffness_Nm_rad: Pair = setting(
-        STOP_STIFFNESS_NM_RAD, unit="Nm/rad", low=1.0, high=1e7, meaning="of a joint stop"
-    )
-    stop_damping_Nm_s: Pair = setting(STOP_DAMPING_NM_S, unit="Nm s/rad", low=0.0, high=1e4, meaning="of a joint stop")
+    stop_stiffness_Nm_rad: Pair = setting((3000.0, 1000.0), unit="Nm/rad", low=1.0, high=1e7, meaning="of a joint stop")
+    stop_damping_Nm_s: Pair = setting((10.0, 2.0), unit="Nm s/rad", low=0.0, high=1e4, meaning="of a joint stop")
     tilt_deg: float = setting(0.0, unit="deg", low=0.0, high=90.0, meaning="of the base; 90: the arm moves upright")
     tilt_direction_deg: float = setting(
         0.0, unit="deg", low=-360.0, high=360.0, meaning="downhill, from the base's x axis"
@@ -175,11 +173,13 @@ class MechanicsSettings:
             )
 
     def arm_numbers(self, arm: EmulatedArm) -> np.void:
-        """Return an arm as one record of dtype ARM_NUMBERS, with the joint stops of these settings.
+        """Return an arm without payload as one record of dtype ARM_NUMBERS, with the joint stops of these settings.
 
         Stop angles that are absent here are the arm's own.
         """
-        numbers = arm.numbers()
+        numbers = pack_fields(arm, ARM_NUMBERS)
+        numbers["alpha"], numbers["beta"], numbers["gamma"] = arm.inertia()
+        numbers["moment_kg_m"] = arm.mass_kg[0] * arm.center_m[0] + arm.mass_kg[1] * arm.link_length_m[0]
         low_deg, high_deg = self._stops_deg(arm)
         numbers["stop_low_rad"], numbers["stop_high_rad"] = np.radians(low_deg), np.radians(high_deg)
         numbers["stop_stiffness_Nm_rad"] = self.stop_stiffness_Nm_rad
@@ -238,10 +238,11 @@ class MechanicsSettings:
                 spring[[joint, motor]] = 1.0, -1.0
                 stiffness += self.stiffness_Nm_rad[joint] * np.outer(spring, spring)
                 damping += self.damping_Nm_s[joint] * np.outer(spring, spring)
+        numbers = self.arm_numbers(arm)
         oscillation, largest = 0.0, 0.0
         for mass_kg, center_m, inertia_kg_m2 in payloads:
             state = np.zeros(1, MECHANICAL_STATE)[0]
-            fit_payload(state, arm.numbers(), mass_kg, center_m[0], center_m[1], inertia_kg_m2)
+            fit_payload(state, numbers, mass_kg, center_m[0], center_m[1], inertia_kg_m2)
             for joint in range(2):
                 state["rotor_kg_m2"][joint] = 0.0 if joint in elastic else self.rotor_inertia_kg_m2[joint]
             for elbow_rad in np.linspace(0.0, math.pi, 5):

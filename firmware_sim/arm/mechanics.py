@@ -48,7 +48,7 @@ from firmware_sim.arm.joint_forces import (
     set_drift,
     warm,
 )
-from firmware_sim.arm.plant import follow_target
+from firmware_sim.arm.plant import CURRENT_LOOP_RAD_S, follow_target
 
 # Rows of the work space; only the touch state has the last one.
 _START: Final = 0
@@ -185,9 +185,8 @@ def _runge_kutta(
     touch, mechanics = work.touch, around.mechanics
     start, stage, end = work.rows[_START], work.rows[_STAGE], work.rows[_END]
     half_s = 0.5 * step_s
-    loop_rad_s = around.arm["current_loop_rad_s"]
-    mid1, end1 = follow_target(start["tau_m"][0], target1, loop_rad_s[0] * step_s)
-    mid2, end2 = follow_target(start["tau_m"][1], target2, loop_rad_s[1] * step_s)
+    mid1, end1 = follow_target(start["tau_m"][0], target1, CURRENT_LOOP_RAD_S * step_s)
+    mid2, end2 = follow_target(start["tau_m"][1], target2, CURRENT_LOOP_RAD_S * step_s)
     stage["tau_m"][0], stage["tau_m"][1] = mid1, mid2
     for rates in (_K2, _K3, _K4):
         length_s = half_s
@@ -320,11 +319,7 @@ def _load(around: Surroundings, touch_state: Vector, work: _StepWork) -> None:
 
 @compiled
 def integrate_mechanics(
-    state: np.void,
-    arm: np.void,
-    mechanics: np.void,
-    contact: Structured,
-    things: Structured,
+    around: Surroundings,
     touch_state: Vector,
     time_s: float,
     elapsed_s: float,
@@ -336,12 +331,11 @@ def integrate_mechanics(
 ) -> None:
     """Advance the mechanical state and the touch state by `step_s` in `substeps` substeps, in place.
 
-    Temperatures change once, at the end. contact: one row of the contact table, or empty; elapsed_s: since its onset.
-    things, touch_state: table and state of bodies, hands and walls for `firmware_sim.arm.touch_forces.touch`; time_s:
-    scenario time, negative before the scenario starts. target: set-points of the drives' torque loops, Nm. space: from
-    `work_space`, overwritten.
+    Temperatures change once, at the end. touch_state: of bodies, hands and walls, for
+    `firmware_sim.arm.touch_forces.touch`. time_s: scenario time, negative before the scenario starts. elapsed_s: since
+    the contact's onset. target: set-points of the drives' torque loops, Nm. space: from `work_space`, overwritten.
     """
-    around = Surroundings(state, arm, mechanics, contact, things)
+    state, mechanics = around.state, around.mechanics
     rows, forces = space[:_ROWS_END], space[_ROWS_END:_FORCES_END].view(FORCES)[0]
     work = _StepWork(rows.view(ROW), _matrix(rows), _matrix(space[_FORCES_END:]), forces)
     _load(around, touch_state, work)
@@ -410,15 +404,7 @@ def _warm(around: Surroundings, step_s: float, work: _StepWork) -> None:
 
 @compiled
 def observe(
-    state: np.void,
-    arm: np.void,
-    mechanics: np.void,
-    contact: Structured,
-    things: Structured,
-    touch_state: Vector,
-    time_s: float,
-    elapsed_s: float,
-    space: Vector,
+    around: Surroundings, touch_state: Vector, time_s: float, elapsed_s: float, space: Vector
 ) -> tuple[float, float, float, float, float, float]:
     """Return the present true values, Nm: external torque, friction along +dq, gravity torque, two joints each.
 
@@ -426,7 +412,6 @@ def observe(
     touch state stay; `rotor_kg_m2` of the state is set, `space` is overwritten. Arguments are as of
     `integrate_mechanics`.
     """
-    around = Surroundings(state, arm, mechanics, contact, things)
     rows, forces = space[:_ROWS_END], space[_ROWS_END:_FORCES_END].view(FORCES)[0]
     work = _StepWork(rows.view(ROW), _matrix(rows), _matrix(space[_FORCES_END:]), forces)
     _load(around, touch_state, work)

@@ -45,7 +45,6 @@ ARM_NUMBERS: Final = float_fields(
         "coulomb_Nm": PAIR,
         "rated_torque_Nm": PAIR,
         "brake_damping_Nm_s": PAIR,
-        "current_loop_rad_s": PAIR,  # rad/s, bandwidth of the drives' torque loops
         "moment_kg_m": (),  # first moment of all masses about joint 1 with link 2 folded into joint 2; no payload
         "stop_low_rad": PAIR,
         "stop_high_rad": PAIR,
@@ -53,8 +52,8 @@ ARM_NUMBERS: Final = float_fields(
         "stop_damping_Nm_s": PAIR,
     }
 )
-"""Filled in by `firmware_sim.arm.arms.EmulatedArm.numbers`. The table is here because
-compiled code contains it, and the cache of compiled code is keyed by the modules that compile."""
+"""Filled in by `firmware_sim.arm.hardware_settings.MechanicsSettings.arm_numbers`. The table is here because compiled
+code contains it, and the cache of compiled code is keyed by the modules that compile."""
 
 MECHANICAL_STATE: Final = float_fields(
     {

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import Vector
 
 ENCODER_COUNTS: Final = 1 << 20
 """Per revolution, 0x608F."""
@@ -112,23 +111,8 @@ class TorqueNoise:
 
 
 class Measurement(NamedTuple):
-    """Measurement of the devices at one SYNC, as raw counts; the properties are in SI units, by the default LSBs."""
+    """Measurement of the devices at one SYNC, as raw counts."""
 
     position_counts: tuple[int, int]
     velocity_counts: tuple[int, int]
     torque_counts: tuple[int, int]
-
-    @property
-    def q(self) -> Vector:
-        """Measured joint position, rad (2,)."""
-        return np.array(self.position_counts) * POSITION_LSB_RAD
-
-    @property
-    def dq(self) -> Vector:
-        """Measured joint velocity, rad/s (2,)."""
-        return np.array(self.velocity_counts) * VELOCITY_LSB_RAD_S
-
-    @property
-    def tau_J(self) -> Vector:
-        """Measured joint torque, Nm (2,)."""
-        return np.array(self.torque_counts) * TORQUE_LSB_NM

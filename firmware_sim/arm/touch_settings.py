@@ -17,11 +17,8 @@ Bodies, hands and walls react to the arm's motion; a body may recede.
 Points and angles are in the world's frame: origin in joint 1, x along link 1 at q₁ = 0. Forces:
 `firmware_sim.arm.touch_forces`.
 
-The human body is as ISO/TS 15066:2016 Annex A models it: mass, spring constant and limits of each body region.
-The standard's two-mass model has a region of effective mass m_H behind a linear spring of constant K (table A.3). Its
-limits (table A.2) are for quasi-static contact, where the region is clamped; in transient contact, where it can recoil,
-they are twice as high. For skull, forehead and face the table has no transient factor: contact there is to be
-prevented.
+The human body is as ISO/TS 15066:2016 Annex A models it: each region is an effective mass m_H behind a linear spring of
+constant K (table A.3).
 """
 
 import math
@@ -109,15 +106,6 @@ class ContactSettings:
         """First 100 µs tick, since the drives were enabled, in which the force no longer acts."""
         return self.onset_tick + ticks(self.duration_s)
 
-    @property
-    def impulse_N_s(self) -> float:
-        """Force integrated from onset to end, N s; without the reduction of a slow point's force in frame "motion"."""
-        if self.shape == "half_sine":
-            return self.force_N * self.duration_s * 2.0 / math.pi
-        if self.shape == "push":
-            return self.force_N * (self.duration_s - self._rise_s())
-        return self.force_N * self.duration_s
-
     def row(self) -> tuple[float, ...]:
         """Return the contact's values for compiled functions, in the order of CONTACT's fields.
 
@@ -199,40 +187,26 @@ def contact_torque(
     return moment, 0.0
 
 
-TRANSIENT_FACTOR: Final = 2.0
-"""Transient over quasi-static limit; table A.2."""
-
-
 class BodyRegion(NamedTuple):
-    """A body region of ISO/TS 15066: one row of table A.3 with its force limits of table A.2.
-
-    has_transient_limit: False for skull, forehead and face.
-    """
+    """A body region of ISO/TS 15066: one row of table A.3."""
 
     mass_kg: float  # effective mass m_H
     stiffness_N_m: float  # effective spring constant K
-    force_N: float  # quasi-static limit
-    has_transient_limit: bool = True
-
-    @property
-    def transient_force_N(self) -> float | None:
-        """Force limit of transient contact, N, `TRANSIENT_FACTOR` times the quasi-static one; None without one."""
-        return TRANSIENT_FACTOR * self.force_N if self.has_transient_limit else None
 
 
 BODY_REGIONS: Final = {
-    "skull_forehead": BodyRegion(4.4, 150e3, 130.0, False),
-    "face": BodyRegion(4.4, 75e3, 65.0, False),
-    "neck": BodyRegion(1.2, 50e3, 150.0),
-    "back_shoulder": BodyRegion(40.0, 35e3, 210.0),
-    "chest": BodyRegion(40.0, 25e3, 140.0),
-    "abdomen": BodyRegion(40.0, 10e3, 110.0),
-    "pelvis": BodyRegion(40.0, 25e3, 180.0),
-    "upper_arm_elbow": BodyRegion(3.0, 30e3, 150.0),
-    "lower_arm_wrist": BodyRegion(2.0, 40e3, 160.0),
-    "hand_finger": BodyRegion(0.6, 75e3, 140.0),
-    "thigh_knee": BodyRegion(75.0, 50e3, 220.0),
-    "lower_leg": BodyRegion(75.0, 60e3, 130.0),
+    "skull_forehead": BodyRegion(4.4, 150e3),
+    "face": BodyRegion(4.4, 75e3),
+    "neck": BodyRegion(1.2, 50e3),
+    "back_shoulder": BodyRegion(40.0, 35e3),
+    "chest": BodyRegion(40.0, 25e3),
+    "abdomen": BodyRegion(40.0, 10e3),
+    "pelvis": BodyRegion(40.0, 25e3),
+    "upper_arm_elbow": BodyRegion(3.0, 30e3),
+    "lower_arm_wrist": BodyRegion(2.0, 40e3),
+    "hand_finger": BodyRegion(0.6, 75e3),
+    "thigh_knee": BodyRegion(75.0, 50e3),
+    "lower_leg": BodyRegion(75.0, 60e3),
 }
 """Regions by the name that a scenario uses."""
 

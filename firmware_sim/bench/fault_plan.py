@@ -152,8 +152,8 @@ class FaultPlan:
         taken, self._actions = self._actions, []
         return taken
 
-    def transmit(self, node: int, can_id: int, data: bytes) -> list[tuple[int, int, bytes]]:
-        """Return the frames that faults make of a node's frame: delay in ns, identifier, data; [] if it is not sent.
+    def transmit(self, node: int, can_id: int, data: bytes) -> Sent:
+        """Return the frames that faults make of a node's frame: delay in ns and data; [] if it is not sent.
 
         Without a fault it is the frame itself, with delay 0. It isn't sent if the node is silent, or if the frame is
         lost or waits until the next one overtakes it, which then brings both. Each call uses up hits and random draws.
@@ -162,11 +162,9 @@ class FaultPlan:
         if node in self._silent:
             return []
         rows = self._sending.get((node, can_id)) or self._sending.get((node, ANY_FRAME))
-        if not rows:
-            return [(0, can_id, data)]
-        return [(delay_ns, can_id, changed) for delay_ns, changed in self._change(rows, can_id, data)]
+        return self._change(rows, can_id, data) if rows else [(0, data)]
 
-    def receive(self, node: int, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+    def receive(self, node: int, can_id: int, data: bytes) -> Sent:
         """Return the frames that faults make of a host's frame to a node: delay in ns and data; [] if it is lost.
 
         Without a fault it is the frame itself, with delay 0. It is [] also while the frame waits to be overtaken by the

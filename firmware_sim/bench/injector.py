@@ -173,11 +173,11 @@ class Injector:
         outbox, plan = self._outbox, self.plan
 
         def put(can_id: int, data: bytes) -> None:
-            for delay_ns, identifier, changed in plan.transmit(place, can_id, data):
+            for delay_ns, changed in plan.transmit(place, can_id, data):
                 if delay_ns:
-                    outbox.put_later(self.now_ns + delay_ns, identifier, changed)
+                    outbox.put_later(self.now_ns + delay_ns, can_id, changed)
                 else:
-                    outbox.put(identifier, changed)
+                    outbox.put(can_id, changed)
 
         return put
 

@@ -44,8 +44,8 @@ from firmware_sim.body.sensors import (
     EncoderNoise,
     encoder_numbers,
     read_angle,
-    settle_transducer,
     transducer_numbers,
+    transducer_state,
 )
 from firmware_sim.scenario.scenario import PayloadSettings, Scenario
 
@@ -275,12 +275,12 @@ class Body:
         for name in ("q", "q_m", "q_encoder"):
             self._arm[name] = self.scenario.start_rad
         state["motor"] = motor_state(self.scenario.drives)
+        state["transducer"] = transducer_state(numbers["transducer"])
         self._course["start_tick"] = -1.0
         self._arm["temperature_C"] = self.scenario.mechanics.ambient_C
         fit_payload(self._arm, numbers["arm"], self.scenario.payload_kg)
         encoder_rad = [read_angle(numbers["encoder"], i, self._arm["q_encoder"][i], 0.0) for i in range(2)]
         self._course["encoder_rad"] = self._course["estimate_rad"] = encoder_rad
-        settle_transducer(numbers["transducer"], state["transducer"], *self._arm["tau_J"], *self._arm["temperature_C"])
 
     def _compile(self) -> None:
         """Call every compiled function once, on a copy of the state, so that none is compiled during a run."""

@@ -17,7 +17,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.records import Vector
 from adacd_hil.structured import Structured, float_fields
-from firmware_sim.arm.joint_forces import MECHANICS_NUMBERS
+from firmware_sim.arm.joint_forces import MECHANICS_NUMBERS, Surroundings
 from firmware_sim.arm.mechanics import integrate_mechanics, observe
 from firmware_sim.arm.plant import (
     ARM_NUMBERS,
@@ -185,10 +185,11 @@ def _measure_tick(state: np.void, numbers: np.void, encoder_noise: NDArray[np.fl
         for joint in range(2):
             heat_motor(motor, state["motor"], joint, arm["tau_m"][joint])
     if numbers["transducer"]["has_memory"] != 0.0:
-        tau_J, temperature_C = arm["tau_J"], arm["temperature_C"]
-        sense_torque(
-            numbers["transducer"], state["transducer"], tick, tau_J[0], tau_J[1], temperature_C[0], temperature_C[1]
-        )
+        for joint in range(2):
+            tau_Nm, other_Nm = arm["tau_J"][joint], arm["tau_J"][1 - joint]
+            sense_torque(
+                numbers["transducer"], state["transducer"], joint, tick, tau_Nm, other_Nm, arm["temperature_C"][joint]
+            )
 
 
 @compiled
@@ -229,10 +230,10 @@ def advance_body(
         target2 = command_torque(motor, motors, 1, wanted2, now["tau_m"][1], mode2 != DriveMode.OFF)
         now["brake_Nm"][0] = mechanics["holding_brake_Nm"][0] if mode1 == DriveMode.OFF else 0.0
         now["brake_Nm"][1] = mechanics["holding_brake_Nm"][1] if mode2 == DriveMode.OFF else 0.0
+        around = Surroundings(now, arm, mechanics, contact, things)
         integrate_mechanics(
-            now, arm, mechanics, contact, things, touch_state,
-            _scenario_s(course), elapsed_s, target1, target2, TICK_S, substeps, work,
-        )  # fmt: skip
+            around, touch_state, _scenario_s(course), elapsed_s, target1, target2, TICK_S, substeps, work
+        )
         add_prescribed_work(
             contact, elapsed_s, TICK_S, arm["link_length_m"][0], before1, before2, now["q"][0], now["q"][1], touch_state
         )
@@ -293,9 +294,8 @@ def fill_truth(
         things, time_s, q1, q2, dq1, dq2, touch_state,
         contact, course["contact"], elapsed_s, arm["link_length_m"][0], touched,
     )  # fmt: skip
-    ext1, ext2, friction1, friction2, held1, held2 = observe(
-        now, arm, numbers["mechanics"], contact, things, touch_state, time_s, elapsed_s, work
-    )
+    around = Surroundings(now, arm, numbers["mechanics"], contact, things)
+    ext1, ext2, friction1, friction2, held1, held2 = observe(around, touch_state, time_s, elapsed_s, work)
     out["tau_ext"][0], out["tau_ext"][1] = ext1, ext2
     out["tau_friction"][0], out["tau_friction"][1] = friction1, friction2
     out["tau_gravity"][0], out["tau_gravity"][1] = held1, held2

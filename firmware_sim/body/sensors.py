@@ -162,6 +162,17 @@ def transducer_numbers(settings: SensorSettings, offset_Nm: tuple[float, float])
     return numbers
 
 
+def transducer_state(numbers: np.void) -> np.void:
+    """Return both sensors' state at power-on, without a load, as one record of dtype TRANSDUCER_STATE.
+
+    Hysteresis begins at its middle. numbers: of `transducer_numbers`.
+    """
+    state: np.void = np.zeros(1, TRANSDUCER_STATE)[0]
+    state["index"] = np.floor(-numbers["clock_phase"])
+    state["sent_index"] = state["index"] - 1.0
+    return state
+
+
 def count_Nm(settings: SensorSettings, joint: int) -> float:
     """Return the torque of one count on the wire, Nm: 1/2^16 of ±50 Nm, or of the sensor's range if that is wider."""
     return TORQUE_LSB_NM * max(1.0, settings.torque_range_Nm[joint] / TORQUE_RANGE_NM)
@@ -193,29 +204,15 @@ def _bridge(numbers: np.void, joint: int, tau_Nm: float, other_Nm: float, temper
 
 
 @compiled
-def settle_transducer(
-    numbers: np.void, state: np.void, tau1_Nm: float, tau2_Nm: float, temperature1_C: float, temperature2_C: float
+def sense_torque(
+    numbers: np.void, state: np.void, joint: int, tick: float, tau_Nm: float, other_Nm: float, temperature_C: float
 ) -> None:
-    """Set both sensors' `state` as at power-on under a steady load; it must be all 0 before.
-
-    Hysteresis begins at its middle. tau: torques in the springs.
-    """
-    state["bridge_Nm"][0] = _bridge(numbers, 0, tau1_Nm, tau2_Nm, temperature1_C)
-    state["bridge_Nm"][1] = _bridge(numbers, 1, tau2_Nm, tau1_Nm, temperature2_C)
-    for joint in range(2):
-        state["shaped_Nm"][joint] = state["bridge_Nm"][joint]
-        state["amplified_Nm"][joint] = state["bridge_Nm"][joint]
-        state["held_Nm"][joint] = state["bridge_Nm"][joint]
-        state["index"][joint] = math.floor(-numbers["clock_phase"][joint])
-        state["sent_index"][joint] = state["index"][joint] - 1.0
-
-
-@compiled
-def _sense_joint(numbers: np.void, state: np.void, joint: int, tick: float, bridge_Nm: float) -> None:
     """Advance one sensor's `state` by the tick that began at `tick`: hysteresis, amplifier, sample of its own clock.
 
-    bridge_Nm: torque at the bridge when the tick ends.
+    Call it only if `has_memory` is set. tau, other: torque in the spring of this joint and of the other one; both and
+    the joint's temperature are at the end of the tick.
     """
+    bridge_Nm = _bridge(numbers, joint, tau_Nm, other_Nm, temperature_C)
     shaped_Nm = bridge_Nm
     weight = numbers["loop_weight"][joint]
     if weight > 0.0:
@@ -244,24 +241,6 @@ def _sense_joint(numbers: np.void, state: np.void, joint: int, tick: float, brid
     state["bridge_Nm"][joint] = bridge_Nm
     state["shaped_Nm"][joint] = shaped_Nm
     state["amplified_Nm"][joint] = amplified_Nm
-
-
-@compiled
-def sense_torque(
-    numbers: np.void,
-    state: np.void,
-    tick: float,
-    tau1_Nm: float,
-    tau2_Nm: float,
-    temperature1_C: float,
-    temperature2_C: float,
-) -> None:
-    """Advance both sensors' `state` by the tick that began at `tick`; call it only if `has_memory` is set.
-
-    Torques in the springs and joint temperatures: at the end of the tick.
-    """
-    _sense_joint(numbers, state, 0, tick, _bridge(numbers, 0, tau1_Nm, tau2_Nm, temperature1_C))
-    _sense_joint(numbers, state, 1, tick, _bridge(numbers, 1, tau2_Nm, tau1_Nm, temperature2_C))
 
 
 @compiled

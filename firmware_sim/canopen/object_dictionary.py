@@ -522,7 +522,7 @@ def contract_of(codec: Codec) -> EmulatedContract:
 
     For other names return `arm`, or `arm_fd` if a frame is longer than `CLASSIC_BYTES`.
     """
-    return CONTRACTS.get(codec.path.stem, CONTRACTS["arm_fd" if is_fd(codec) else "arm"])
+    return CONTRACTS.get(codec.path.stem, CONTRACTS["arm_fd" if codec.is_fd else "arm"])
 
 
 def playable_contract(codec: Codec) -> EmulatedContract:
@@ -545,11 +545,6 @@ def playable_contract(codec: Codec) -> EmulatedContract:
     )
 
 
-def is_fd(codec: Codec) -> bool:
-    """Return whether some frame of the contract is longer than `CLASSIC_BYTES`."""
-    return any(message.length > CLASSIC_BYTES for message in codec.messages.values())
-
-
 def longest_pdo(codec: Codec) -> int:
     """Return the longest PDO of this contract's bus, bytes: `CLASSIC_BYTES`, with CAN FD the last of `FD_LENGTHS`."""
-    return FD_LENGTHS[-1] if is_fd(codec) else CLASSIC_BYTES
+    return FD_LENGTHS[-1] if codec.is_fd else CLASSIC_BYTES

@@ -29,12 +29,13 @@ class TransmitPdo(PdoRecord):
 
     is_received = False
 
-    def __init__(self, pdos: "Pdos", index: int, message: MessageCodec | None) -> None:
-        super().__init__(pdos.dictionary, index, message, pdos.longest, pdos.message_ids, pdos.refresh)
+    def __init__(self, pdos: "Pdos", index: int, messages: Mapping[int, MessageCodec]) -> None:
+        super().__init__(pdos.dictionary, index, messages, pdos.longest, pdos.refresh)
         self._pdos = pdos
         self.is_due = False
         """Whether an event has happened that the bus hasn't seen."""
         self._reads: tuple[Callable[[], int], ...] = ()
+        message = self.message
         self._sender = None if message is None or not message.is_protected else message.sender()
         self.send: Callable[[], None] = lambda: None
         """Sends the present values."""
@@ -136,9 +137,10 @@ class ReceivePdo(PdoRecord):
 
     is_received = True
 
-    def __init__(self, pdos: "Pdos", index: int, message: MessageCodec | None) -> None:
-        super().__init__(pdos.dictionary, index, message, pdos.longest, pdos.message_ids, pdos.refresh)
+    def __init__(self, pdos: "Pdos", index: int, messages: Mapping[int, MessageCodec]) -> None:
+        super().__init__(pdos.dictionary, index, messages, pdos.longest, pdos.refresh)
         self._pdos = pdos
+        message = self.message
         self.receiver = None if message is None or not message.is_protected else message.receiver()
         """Checks the frames of the contract's message; None where that isn't protected."""
         self.acted_ns: int | None = None
@@ -190,13 +192,6 @@ class ReceivePdo(PdoRecord):
         if self.type in EVENT_DRIVEN:
             self._pdos.act_at_once(self, self._pdos.own_ns(t_ns))
 
-    def is_late(self, t_ns: int) -> bool:
-        """Return whether the last frame acted at least an event timer ago; t_ns: on the device's clock.
-
-        False without a timer, or before the first frame.
-        """
-        return self.timer_ns > 0 and self.acted_ns is not None and t_ns - self.acted_ns >= self.timer_ns
-
 
 class Pdos:
     """All PDOs of one device."""
@@ -216,8 +211,6 @@ class Pdos:
         self.dictionary = dictionary
         self.send = send
         self.longest = longest
-        self.message_ids = frozenset(messages)
-        """Identifiers of the contract, which the device hears besides those that any PDO may have."""
         self.act: Callable[[int], None] = lambda _t_ns: None
         """Called when a frame that doesn't wait for SYNC has been written."""
         self.mind_length: Callable[[bool, int], None] = lambda _is_right, _t_ns: None
@@ -242,13 +235,11 @@ class Pdos:
         """Identifiers of the frames that follow every SYNC."""
         self._asynchronous: tuple[TransmitPdo, ...] = ()
         self._compared: tuple[TransmitPdo, ...] = ()
-        self.has_compared = False
-        """Whether the events of an active PDO of type 254 or 255 are the changes of its content."""
         self._receiving: tuple[ReceivePdo, ...] = ()
         self._waiting: tuple[ReceivePdo, ...] = ()
         self._sending: frozenset[TransmitPdo] = frozenset()
-        self.receive = tuple(ReceivePdo(self, i, _message(self, messages, i)) for i in _records(self, RECEIVE))
-        self.transmit = tuple(TransmitPdo(self, i, _message(self, messages, i)) for i in _records(self, TRANSMIT))
+        self.receive = tuple(ReceivePdo(self, i, messages) for i in _records(self, RECEIVE))
+        self.transmit = tuple(TransmitPdo(self, i, messages) for i in _records(self, TRANSMIT))
         dictionary.serve(0x2100, 1, lambda: self.header[0])
         dictionary.serve(0x2100, 2, lambda: self.header[1])
         dictionary.serve(0x2101, 1, lambda: int.from_bytes(self.header[:2], "little"))
@@ -310,7 +301,6 @@ class Pdos:
         self.on_sync = tuple(pdo.send if pdo.type == 1 else pdo.on_sync for pdo in sending if pdo.is_synchronous)
         self._asynchronous = tuple(pdo for pdo in sending if not pdo.is_synchronous)
         self._compared = tuple(pdo for pdo in self._asynchronous if pdo.is_compared)
-        self.has_compared = bool(self._compared)
         self._waiting = tuple(pdo for pdo in self._receiving if pdo.is_synchronous)
         self._find_commands()
         self.on_refresh()
@@ -360,16 +350,9 @@ class Pdos:
                 is_commanded = is_commanded or pdo.is_command
         return is_commanded
 
-    def find_late(self, t_ns: int) -> bool:
-        """Return whether the last frame of some active RPDO acted at least its event timer ago.
-
-        t_ns: on the device's clock.
-        """
-        return any(pdo.is_late(t_ns) for pdo in self._receiving)
-
     @property
     def deadline_ns(self) -> int:
-        """Time on the device's clock at which the first RPDO gets late, ns.
+        """Time on the device's clock from which some active RPDO is late: its last frame acted an event timer ago, ns.
 
         It is NEVER_NS if no RPDO has an event timer and an earlier frame.
         """
@@ -407,11 +390,3 @@ class Pdos:
 
 def _records(pdos: Pdos, first: int) -> list[int]:
     return [index for index in range(first, first + COUNT) if pdos.dictionary.has(index, 1)]
-
-
-def _message(pdos: Pdos, messages: Mapping[int, MessageCodec], index: int) -> MessageCodec | None:
-    """Return the contract's message with a PDO's present COB-ID; None if the contract has none.
-
-    index: of the PDO's communication object, 0x1400 or 0x1800 on. Raises `Refusal` if the device lacks its COB-ID.
-    """
-    return messages.get(pdos.dictionary.value(index, 1) & 0x7FF)

@@ -7,7 +7,7 @@ instead of objects) leave gaps in frames that are received. Source: CiA 301 (4.2
 """
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -51,21 +51,21 @@ class PdoRecord:
         self,
         dictionary: ObjectDictionary,
         index: int,
-        message: MessageCodec | None,
+        messages: Mapping[int, MessageCodec],
         longest: int,
-        message_ids: frozenset[int],
         refresh: Callable[[], None],
     ) -> None:
         """Read the defaults, and watch the record's objects.
 
-        A default mapping that no master could write counts as empty. `longest`: the longest frame, bytes.
-        `message_ids`: identifiers of the contract. `refresh`: called after each write of the record except of inhibit
-        time and mapping entries. `message`: the contract's with the PDO's default COB-ID, None without one.
+        A default mapping that no master could write counts as empty. `messages`: the contract's, by identifier.
+        `longest`: the longest frame, bytes. `refresh`: called after each write of the record except of inhibit time and
+        mapping entries.
         """
-        self._dictionary, self._longest, self._message_ids, self._refresh = dictionary, longest, message_ids, refresh
+        self._dictionary, self._longest, self._messages, self._refresh = dictionary, longest, messages, refresh
         self.layout = NOTHING
-        self.message = message
         self.can_id = dictionary.value(index, 1) & 0x7FF
+        self.message = messages.get(self.can_id)
+        """The contract's message with the PDO's default COB-ID; None without one."""
         self._is_valid = not dictionary.value(index, 1) & NOT_VALID
         self._can_be_invalid = dictionary.find(index, 1).writable
         self.type = dictionary.value_or(EVENT_DRIVEN[-1], index, 2)
@@ -100,7 +100,7 @@ class PdoRecord:
         can_id = value & 0x7FF
         if value & _IS_EXTENDED or value & 0x1FFFF800 or _is_restricted(can_id):
             refuse(Abort.VALUE_RANGE)
-        if self.is_received and can_id not in LISTENED_IDS and can_id not in self._message_ids:
+        if self.is_received and can_id not in LISTENED_IDS and can_id not in self._messages:
             refuse(Abort.VALUE_RANGE)
         if self._is_valid and not value & NOT_VALID and can_id != self.can_id:
             refuse(Abort.DEVICE_STATE)

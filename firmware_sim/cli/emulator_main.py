@@ -26,7 +26,7 @@ from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_text import to_short_toml, to_toml
 from adacd_hil.start import ExitCode, explain_statuses
 from adacd_hil.table_layout import fit_table
-from adacd_hil.terminal import open_terminals, terminal_columns, write_result
+from adacd_hil.terminal import on_interrupt, open_terminals, terminal_columns, write_result
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import Codec, CodecError
 from adacd_hil.wire.dbc_contract import load_codec
@@ -40,7 +40,7 @@ from firmware_sim.canopen.object_dictionary import CONTRACTS, EmulatedContract
 from firmware_sim.canopen.pdo_record import LAST_NODE
 from firmware_sim.cli.own_devices import rehearse
 from firmware_sim.cli.scenario_list import check, describe_all
-from firmware_sim.cli.service import Service, open_devices_end, stop_by_signal
+from firmware_sim.cli.service import Service, StopRequest, open_devices_end
 from firmware_sim.scenario.scenario import Scenario, load_scenario, load_truth, truth_names
 
 _ENDED = "ended by SIGINT, SIGTERM, SIGHUP or --once"
@@ -163,7 +163,8 @@ def run(
             stack.enter_context(removing_empty_folders(out))
         bus = open_devices_end(interface, channel, clock, codec)
         stack.callback(bus.close)
-        stop = stack.enter_context(stop_by_signal())
+        stop = StopRequest()
+        stack.enter_context(on_interrupt(stop.make))
         log: TruthLog | None = None
         if out is not None:
             metadata = {"scenario": resolved.name, "profile": resolved.arm.name, "seed": str(resolved.seed)}
@@ -228,7 +229,8 @@ def play(
     with ExitStack() as stack:
         bus = open_devices_end(interface, channel, clock, codec)
         stack.callback(bus.close)
-        stop = stack.enter_context(stop_by_signal())
+        stop = StopRequest()
+        stack.enter_context(on_interrupt(stop.make))
         departure = Departure(bus)
         bench = RecordedBench(
             load_scenario("idle"),

@@ -1,13 +1,7 @@
 """The service that carries frames and time between a bench and a bus."""
 
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
-
 from adacd_hil.clock import Clock
 from adacd_hil.records import JOINTS
-from adacd_hil.terminal import hurry
 from adacd_hil.wire.bus import Bus, BusError, Frame, InterfaceDownError
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.open_bus import open_bus
@@ -15,7 +9,6 @@ from adacd_hil.wire.time_marks import HOST_MARK, NEVER_NS
 from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.bench.bench_time import LONGEST_ORPHANAGE_NS
 from firmware_sim.bench.injector import Departure
-from firmware_sim.canopen.object_dictionary import is_fd
 from firmware_sim.canopen.pdo_record import LISTENED_IDS
 
 _IDLE_NS = 10_000_000  # without SYNC for this long, timers go by the clock: heartbeats before and between runs
@@ -29,10 +22,9 @@ class StopRequest:
     def __init__(self) -> None:
         self.is_made = False
 
-    def make(self, *_signal: object) -> None:
-        """Set `is_made`, and cut short waits of the terminal; callable as a signal handler."""
+    def make(self) -> None:
+        """Set `is_made`; callable while a signal is handled."""
         self.is_made = True
-        hurry()
 
 
 class Service:
@@ -168,24 +160,6 @@ class Service:
         return not self._is_wall or self._bench.is_at_rest or now_ns - self._gone_ns > LONGEST_ORPHANAGE_NS
 
 
-@contextmanager
-def stop_by_signal() -> Iterator[StopRequest]:
-    """Yield a request that SIGINT, SIGTERM and SIGHUP make, instead of ending the process.
-
-    At the end the former handlers are back. An ignored SIGHUP stays ignored.
-    """
-    stop = StopRequest()
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # not started to outlive its terminal
-        numbers.append(signal.SIGHUP)
-    previous = {number: signal.signal(number, stop.make) for number in numbers}
-    try:
-        yield stop
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-
 def open_devices_end(interface: str, channel: str, clock: Clock, codec: Codec) -> Bus:
     """Return the devices' end of a bus, open.
 
@@ -194,5 +168,4 @@ def open_devices_end(interface: str, channel: str, clock: Clock, codec: Codec) -
     """
     heard = {message.can_id for message in codec.messages.values() if "HOST" in message.senders} | LISTENED_IDS
     heard.add(HOST_MARK)
-    options: dict[str, Any] = {"is_fd": True} if is_fd(codec) else {}
-    return open_bus(interface, channel, clock, sorted(heard), **options)
+    return open_bus(interface, channel, clock, sorted(heard), is_fd=codec.is_fd)

@@ -245,7 +245,7 @@ class DriveNode(Application):
         if self._is_braking:
             self._watch_standstill(t_ns)
         self._drive_motor()
-        if self._pdos.has_compared and self._pdos.compare():
+        if self._pdos.compare():
             self.has_news = True
 
     def act(self, t_ns: int) -> None:
@@ -569,9 +569,10 @@ class DriveNode(Application):
             due_ns = self._patience.sync_due_ns
             if t_ns >= due_ns:
                 self._fault(Watchdog.SYNC, t_ns, is_found_by_time=True)
-        if self._pdos.find_late(t_ns):
+        late_ns = self._pdos.deadline_ns
+        if t_ns >= late_ns:
             self._fault(Watchdog.COMMAND, t_ns, is_found_by_time=True)
-        return min(due_ns, self._pdos.deadline_ns) if self.is_enabled else t_ns
+        return min(due_ns, late_ns) if self.is_enabled else t_ns
 
     @property
     def _obstacle(self) -> int:
@@ -581,7 +582,7 @@ class DriveNode(Application):
         return 2 if self.device.is_operational else 1
 
     def _is_command_missing(self, t_ns: int) -> bool:
-        return self._patience.is_command_missing or self._pdos.find_late(t_ns)
+        return self._patience.is_command_missing or t_ns >= self._pdos.deadline_ns
 
     def _watch_standstill(self, t_ns: int) -> None:
         """End the braking once the motor has stood still for `REST_NS`, or has braked for `LONGEST_BRAKING_NS`.

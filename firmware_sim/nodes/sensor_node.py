@@ -97,7 +97,7 @@ class SensorNode(Application):
         lowest, highest = self._ends
         self._torque = torque if lowest <= torque <= highest else lowest if torque < lowest else highest
         self._counts = counts
-        if self._pdos.has_compared and self._pdos.compare():
+        if self._pdos.compare():
             self.has_news = True
 
     def set_error(self, bits: int) -> None:

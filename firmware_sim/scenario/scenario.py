@@ -28,9 +28,9 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib import resources
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
@@ -83,7 +83,7 @@ class ExpectSettings:
     force_N: float | None = setting(None, unit="N", low=0.0, high=1e6, meaning="largest contact force")
 
     def __post_init__(self) -> None:
-        for key in _COUNTS:
+        for key in COUNTS:
             least, most = getattr(self, key), getattr(self, f"{key}_most")
             if most is not None and most < least:
                 raise ConfigError(f"`expect.{key}_most` = {most} is below `expect.{key}` = {least}")
@@ -115,70 +115,9 @@ class ExpectSettings:
         return f"{least}" if most is None else f"{least}-{most}"
 
 
-_COUNTS: Final = ("adaptations", "contacts", "false_alarms", "missed")
+COUNTS: Final = ("adaptations", "contacts", "false_alarms", "missed")
+"""Keys of `ExpectSettings` that are counts, each with its `_most`."""
 _TROUBLES: Final = (("false_alarms", "false"), ("missed", "missed"))
-
-
-class ScenarioOutcome(NamedTuple):
-    """The outcome of a run, named as in `ExpectSettings`. Times, s, since motion start; None: it did not happen.
-
-    fault: reason of the first fault. adaptation_s: of the first adaptation. delay_ms: the longest of all detected
-    contacts, None without any. force_N: largest true contact force, 0 without any.
-    """
-
-    end: str
-    fault: str | None
-    fault_s: float | None
-    adaptations: int
-    adaptation_s: float | None
-    contacts: int
-    false_alarms: int
-    missed: int
-    delay_ms: float | None
-    force_N: float
-
-    @property
-    def text(self) -> str:
-        """The outcome in a few words, in the form of `ExpectSettings.text`."""
-        return ExpectSettings(
-            adaptations=self.adaptations,
-            contacts=self.contacts,
-            false_alarms=self.false_alarms,
-            missed=self.missed,
-            end=self.end,
-            fault=self.fault,
-        ).text
-
-
-def deviations(expect: ExpectSettings, outcome: ScenarioOutcome) -> tuple[str, ...]:
-    """Return the differences of an outcome from an expectation, a line each; () if it is as expected.
-
-    A time that is expected within bounds but is None is a difference. A bound on delay or force is not checked where
-    the outcome is None.
-    """
-    found = []
-    for key in ("end", "fault"):
-        wanted, got = getattr(expect, key), getattr(outcome, key)
-        if got != wanted:
-            found.append(f"{key}: {got or 'none'}, expected {wanted or 'none'}")
-    for key in _COUNTS:
-        least, most, got = getattr(expect, key), getattr(expect, f"{key}_most"), getattr(outcome, key)
-        if not least <= got <= (least if most is None else most):
-            found.append(f"{key}: {got}, expected {least if most is None else f'{least} to {most}'}")
-    for key in ("fault_s", "adaptation_s"):
-        pair, time_s = getattr(expect, key), getattr(outcome, key)
-        if pair is not None and not (time_s is not None and pair[0] <= time_s <= pair[1]):
-            found.append(f"{key}: {_number(time_s)} s, expected {pair[0]:g} to {pair[1]:g} s")
-    for key in ("delay_ms", "force_N"):
-        bound, got = getattr(expect, key), getattr(outcome, key)
-        if bound is not None and got is not None and got > bound:
-            unit = next(field.metadata["unit"] for field in fields(ExpectSettings) if field.name == key)
-            found.append(f"{key}: {_number(got)} {unit}, expected at most {bound:g} {unit}")
-    return tuple(found)
-
-
-def _number(value: float | None) -> str:
-    return "none" if value is None else f"{value:.4g}"
 
 
 @dataclass(frozen=True)
@@ -286,14 +225,6 @@ class Scenario:
                     f"`{key}[{index}]`: at at_s = 0 s the arm in its start pose {self.start_deg} deg "
                     f"is {overlap_m:.4g} m inside it"
                 )
-
-    def expected_of(self, scheme: str) -> ExpectSettings | None:
-        """Return the expected outcome with a healthy host of a scheme, `paper` or `certified`.
-
-        `certified`: `expect_certified` if the file has that. Otherwise `expect`, None if the file lacks it.
-        """
-        own = self.expect_certified if scheme == "certified" else None
-        return own or self.expect
 
     @property
     def arm(self) -> EmulatedArm:

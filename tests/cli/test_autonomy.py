@@ -11,7 +11,7 @@ import can
 import pytest
 from called import called
 
-from adacd_hil.cli.connection import check_autonomy, check_clock, on_interrupt
+from adacd_hil.cli.connection import check_autonomy, check_clock
 from adacd_hil.cli.embedded_run import USER, resolve
 from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.scheduling import RealtimeGrant, scheduler_name
@@ -19,6 +19,7 @@ from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings
 from adacd_hil.settings.setting_keys import apply_settings
 from adacd_hil.settings.toml_files import builtin_names
+from adacd_hil.terminal import on_interrupt
 from adacd_hil.wire.can_interface import InterfaceState, is_virtual
 
 CERTIFIED = load_settings("certified")
@@ -163,7 +164,7 @@ def test_a_signal_asks_for_the_end(number):
 def test_a_command_that_was_started_to_outlive_its_terminal_goes_on_after_a_hang_up():
     program = (
         "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
-        "from adacd_hil.cli.connection import on_interrupt\n"
+        "from adacd_hil.terminal import on_interrupt\n"
         "with on_interrupt(lambda: print('asked')):\n"
         "    signal.raise_signal(signal.SIGHUP)\n"
     )

@@ -10,7 +10,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from firmware_sim.arm.arms import ARMS, EmulatedArm
 from firmware_sim.arm.hardware_settings import MechanicsSettings
-from firmware_sim.arm.joint_forces import gravity_torque
+from firmware_sim.arm.joint_forces import Surroundings, gravity_torque
 from firmware_sim.arm.mechanics import integrate_mechanics, observe, work_space
 from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, mass_matrix
 from firmware_sim.arm.sensing import DriveMode
@@ -76,10 +76,8 @@ def run_arm(
                 tau1, tau2,
             )  # fmt: skip
             states[index] = touch_state
-        integrate_mechanics(
-            state, arm, mechanics, contact, things, touch_state,
-            time_s, time_s, target1[index], target2[index], TICK_S, substeps, work,
-        )  # fmt: skip
+        around = Surroundings(state, arm, mechanics, contact, things)
+        integrate_mechanics(around, touch_state, time_s, time_s, target1[index], target2[index], TICK_S, substeps, work)
         history[index] = state
 
 
@@ -169,9 +167,8 @@ class GeneralArm:
     def observe(self, contact=NOBODY) -> dict[str, np.ndarray]:
         """External torque, friction and gravity torque now."""
         time_s = self.tick * TICK_S
-        values = observe(
-            self.state, self.numbers, self.mechanics, contact, self.things, self.touch_state, time_s, time_s, self.work
-        )
+        around = Surroundings(self.state, self.numbers, self.mechanics, contact, self.things)
+        values = observe(around, self.touch_state, time_s, time_s, self.work)
         return {name: np.array(values[2 * i : 2 * i + 2]) for i, name in enumerate(("tau_ext", "friction", "gravity"))}
 
     @property

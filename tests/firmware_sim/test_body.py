@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from general_arm import BRAKE, OFF, TORQUE, truth_of
+from lab_arm import theta_of
 
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.touch_settings import ContactSettings
@@ -82,7 +83,7 @@ def test_truth_tells_the_parameters_with_payload():
         payload_kg = 1.0 if 5 <= cycle < 8 else 0.0
         truth = truth_of(body)
         assert truth["payload"] == payload_kg
-        assert truth["theta"] == pytest.approx(ARMS["P"].theta(payload_kg), rel=1e-14)
+        assert truth["theta"] == pytest.approx(theta_of(ARMS["P"], payload_kg), rel=1e-14)
         body.advance((0.0, 0.0), OFF)
 
 

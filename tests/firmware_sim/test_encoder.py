@@ -8,6 +8,7 @@ from general_arm import BRAKE, OFF, TORQUE, truth_of
 
 from adacd_hil.settings.parsing import parse
 from firmware_sim.arm.hardware_settings import SensorSettings
+from firmware_sim.arm.sensing import POSITION_LSB_RAD
 from firmware_sim.body.body import Body
 from firmware_sim.body.sensors import NOISE_TICKS, encoder_numbers, read_angle
 from firmware_sim.scenario.scenario import Scenario
@@ -51,7 +52,7 @@ def test_a_coarser_encoder_steps_in_whole_counts_of_the_wire(bits):
 def test_an_index_error_shifts_the_position_from_power_on_and_gives_no_velocity():
     body = arm(noise=False, index_error_rad=[0.01, -0.02], eccentricity_rad=[1e-3, 1e-3])
     first = body.sample()
-    assert first.q == pytest.approx([0.01, -0.02], abs=3.1e-6)
+    assert np.array(first.position_counts) * POSITION_LSB_RAD == pytest.approx([0.01, -0.02], abs=3.1e-6)
     for _ in range(20):
         body.advance((0.0, 0.0), OFF)
         assert body.sample() == first

@@ -1,9 +1,10 @@
 """Expectations of a scenario: what is refused, and which runs differ from what is expected."""
 
 import pytest
+from played_outcome import ScenarioOutcome, deviations, expected_of
 
 from adacd_hil.settings.parsing import parse
-from firmware_sim.scenario.scenario import ExpectSettings, Scenario, ScenarioOutcome, deviations
+from firmware_sim.scenario.scenario import ExpectSettings, Scenario
 
 EXPECTED = ExpectSettings(
     adaptations=1, contacts=2, false_alarms=1, false_alarms_most=3, adaptation_s=(5.0, 6.0), delay_ms=30.0, force_N=80.0
@@ -62,10 +63,10 @@ def test_a_fault_is_expected_with_its_time():
 
 def test_a_certified_host_has_its_own_expectation_where_there_is_one():
     both = parse(Scenario, {"expect": FEW, "expect_certified": FEW | {"contacts": 2}})
-    assert (both.expected_of("paper").contacts, both.expected_of("certified").contacts) == (1, 2)
+    assert (expected_of(both, "paper").contacts, expected_of(both, "certified").contacts) == (1, 2)
 
 
 def test_without_an_own_expectation_a_certified_host_is_to_do_what_the_papers_does():
     one = parse(Scenario, {"expect": FEW})
-    assert one.expected_of("certified") == one.expect
-    assert parse(Scenario, {}).expected_of("certified") is None
+    assert expected_of(one, "certified") == one.expect
+    assert expected_of(parse(Scenario, {}), "certified") is None

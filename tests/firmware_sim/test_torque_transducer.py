@@ -18,8 +18,8 @@ from firmware_sim.body.sensors import (
     converter_ends,
     sample_torque,
     sense_torque,
-    settle_transducer,
     transducer_numbers,
+    transducer_state,
     walk_offset,
 )
 from firmware_sim.scenario.scenario import Scenario
@@ -28,16 +28,16 @@ from firmware_sim.scenario.scenario import Scenario
 class Sensors:
     """Both torque sensors on a bench of their own: loads in, counts out."""
 
-    def __init__(self, offset_Nm=(0.0, 0.0), start_Nm=(0.0, 0.0), **settings) -> None:
+    def __init__(self, offset_Nm=(0.0, 0.0), **settings) -> None:
         self.numbers = transducer_numbers(parse(SensorSettings, settings), offset_Nm)
-        self.state = np.zeros(1, TRANSDUCER_STATE)[0]
+        self.state = transducer_state(self.numbers)
         self.tick = 0
-        self.tau_Nm = start_Nm
-        settle_transducer(self.numbers, self.state, *start_Nm, 25.0, 25.0)
+        self.tau_Nm = (0.0, 0.0)
 
     def load(self, tau1_Nm: float, tau2_Nm: float = 0.0) -> None:
         """Go on by a tick that ends with this load."""
-        sense_torque(self.numbers, self.state, float(self.tick), tau1_Nm, tau2_Nm, 25.0, 25.0)
+        sense_torque(self.numbers, self.state, 0, float(self.tick), tau1_Nm, tau2_Nm, 25.0)
+        sense_torque(self.numbers, self.state, 1, float(self.tick), tau2_Nm, tau1_Nm, 25.0)
         self.tau_Nm = (tau1_Nm, tau2_Nm)
         self.tick += 1
 
@@ -77,13 +77,13 @@ def test_a_warm_joint_shifts_the_zero_and_the_sensitivity():
 
 def test_the_zero_drifts_at_its_slope_from_power_on():
     body = Body(parse(Scenario, {"noise": False, "sensors": {"offset_drift_Nm_s": [0.5, -2.0]}}))
-    measured = [body.sample().tau_J]
+    measured = [body.sample().torque_counts]
     for _ in range(10):
         body.advance((0.0, 0.0), OFF, 1000)
-        measured.append(body.sample().tau_J)
-    slopes = np.polyfit(np.arange(11) * 0.1, np.array(measured), 1)[0]
+        measured.append(body.sample().torque_counts)
+    slopes = np.polyfit(np.arange(11) * 0.1, np.array(measured) * TORQUE_LSB_NM, 1)[0]
     assert slopes == pytest.approx([0.5, -2.0], abs=2e-3)
-    assert measured[0].tolist() == [0.0, 0.0]
+    assert measured[0] == (0, 0)
 
 
 @pytest.mark.parametrize("is_regular", [True, False])

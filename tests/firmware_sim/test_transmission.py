@@ -101,5 +101,5 @@ def test_the_encoder_is_on_its_side_of_the_spring(side):
     state = truth_of(body)
     read = state["q_m"] if side == "motor" else state["q"]
     assert np.abs(state["q_m"] - state["q"]).min() > 10.0 * POSITION_LSB_RAD
-    assert body.sample().q == pytest.approx(read, abs=0.51 * POSITION_LSB_RAD)
+    assert body.sample().position_counts == pytest.approx(read / POSITION_LSB_RAD, abs=0.51)
     assert body.motor_torque_Nm == pytest.approx((5.0, 2.0), rel=1e-9)

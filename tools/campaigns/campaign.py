@@ -27,7 +27,7 @@ from campaign_loop import play_trials
 from adacd_hil.cli.output import format_table
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
-from firmware_sim.scenario.scenario import builtin_scenarios, deviations, load_scenario
+from firmware_sim.scenario.scenario import builtin_scenarios, load_scenario
 
 CONFIGS = ("paper", "certified")
 
@@ -54,13 +54,13 @@ class Row:
 
 def play(task: tuple[str, str], seed: int | None, keep: Path | None) -> Row:
     """Play one scenario, or its file, with one configuration, its logs in a folder of `keep` or nowhere."""
-    from played_outcome import outcome_of
+    from played_outcome import deviations, expected_of, outcome_of
 
     from adacd_hil.cli.embedded_run import resolve, run_embedded
 
     name_or_file, config = task
     scenario = load_scenario(name_or_file)
-    expect = scenario.expected_of(load_settings(config).scheme)
+    expect = expected_of(scenario, load_settings(config).scheme)
     expected = expect.text if expect else "–"
     try:
         cast = resolve(config, name_or_file, None, seed)

@@ -23,6 +23,7 @@ import numpy as np
 from campaign_certified import CertifiedScheme
 from campaign_loop import add_jobs, add_seeds, play_trials
 from lab import PERIOD_S, Motion, cut, join, profile_arm, random_motion, record, still
+from lab_arm import theta_of
 from numpy.typing import NDArray
 from played_record import play_record
 
@@ -55,7 +56,7 @@ ELASTIC_DAMPING, ROTOR_KG_M2 = 0.02, (0.05, 0.01)
 
 def mechanics_of(error: str, arm: EmulatedArm) -> MechanicsSettings:
     """Return what the error named does to the arm; the rigid plant where it is another's."""
-    coulomb_Nm, inertia = np.array(arm.coulomb_Nm), arm.theta()[[0, 2]]
+    coulomb_Nm, inertia = np.array(arm.coulomb_Nm), theta_of(arm)[[0, 2]]
 
     def pair(values: Array) -> tuple[float, float]:
         return float(values[0]), float(values[1])
@@ -184,7 +185,7 @@ def play(case: Case, minutes: float, changes: Mapping[str, str]) -> Played:
     feedforward, payloads = [(2.5, arm.theta)], []
     if loaded_at >= 0:
         payloads.append(((loaded_at - 50) * PERIOD_S, case.kg))
-        feedforward.append((loaded_at * PERIOD_S + 1.0, arm.arm.theta(case.kg)))
+        feedforward.append((loaded_at * PERIOD_S + 1.0, theta_of(arm.arm, case.kg)))
     measured = record(arm, motion, seed=case.seed, feedforward=feedforward, payloads=payloads)
     tau_J = measured.tau_J
     if case.error in CABLES_NM:  # as one whose torque the motor makes up for, on the same way

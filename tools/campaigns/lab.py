@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from lab_arm import LabArm, profile_arm, random_arm
+from lab_arm import LabArm, profile_arm, random_arm, theta_of
 from lab_motion import PERIOD_S, Motion, cut, join, multisine, paper_motion, random_motion, random_moves, still
 from numpy.typing import NDArray
 
@@ -231,7 +231,7 @@ def record(
     )  # fmt: skip
     theta = np.tile(arm.theta, (count, 1))
     for at_s, mass_kg in payloads:
-        theta[round(at_s / PERIOD_S) :] = arm.arm.theta(mass_kg)
+        theta[round(at_s / PERIOD_S) :] = theta_of(arm.arm, mass_kg)
     theta[:, 3:5] *= drift[:, :1]
     theta[:, 5:7] *= drift[:, 1:]
     return Recording(arm, motion, tuple(contacts), tuple(pushes), seed, q, dq, tau_J, tau_c, tau_ext, theta)

@@ -25,6 +25,16 @@ LOAD_SHARE = (0.02, 0.02)
 _REFERENCE = "S"  # whose gains are scaled with the inertia
 
 
+def theta_of(arm: EmulatedArm, payload_kg: float = 0.0) -> NDArray[np.float64]:
+    """Return an arm's parameters (7,) in the order of `records.PARAMETER_NAMES`, with a point mass at its tip."""
+    alpha, beta, gamma = arm.inertia()
+    length1_m, length2_m = arm.link_length_m
+    alpha += payload_kg * length1_m**2
+    beta += payload_kg * length1_m * length2_m
+    gamma += payload_kg * length2_m**2
+    return np.array([alpha + gamma, beta, gamma, *arm.viscous_Nm_s, *arm.coulomb_Nm])
+
+
 @dataclass(frozen=True)
 class LabArm:
     """An arm to be recorded. torque_offset_Nm: zero error of the torque sensors; pairs are (joint 1, joint 2)."""
@@ -48,7 +58,7 @@ class LabArm:
     @cached_property
     def theta(self) -> NDArray[np.float64]:
         """True parameters (7,), payload included, at the beginning of the record's drift."""
-        return self.arm.theta(self.payload_kg)
+        return theta_of(self.arm, self.payload_kg)
 
     @property
     def mechanics(self) -> MechanicsSettings:
@@ -114,7 +124,7 @@ def random_arm(seed: int, payload_kg: float = 0.0, friction: str = "plain", **ch
         viscous_Nm_s=(float(viscous[0]), float(viscous[1])),
         coulomb_Nm=(float(coulomb[0]), float(coulomb[1])),
     )
-    scale = drawn.theta()[[0, 2]] / low.theta()[[0, 2]]
+    scale = theta_of(drawn)[[0, 2]] / theta_of(low)[[0, 2]]
     torque = np.maximum(1.0, scale)
     drawn = replace(
         drawn, rated_torque_Nm=(low.rated_torque_Nm[0] * float(torque[0]), low.rated_torque_Nm[1] * float(torque[1]))

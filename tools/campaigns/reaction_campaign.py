@@ -39,6 +39,25 @@ TOLERANCE = 1.02
 TOUCHING_N = 0.5
 APART_S = 0.02
 """Contacts with less than this between them are one."""
+QUASI_STATIC_N = {
+    "skull_forehead": 130.0,
+    "face": 65.0,
+    "neck": 150.0,
+    "back_shoulder": 210.0,
+    "chest": 140.0,
+    "abdomen": 110.0,
+    "pelvis": 180.0,
+    "upper_arm_elbow": 150.0,
+    "lower_arm_wrist": 160.0,
+    "hand_finger": 140.0,
+    "thigh_knee": 220.0,
+    "lower_leg": 130.0,
+}
+"""Limit of the force on a region that is clamped; table A.2."""
+TRANSIENT_FACTOR = 2.0
+"""Limit where the region can recoil, over that; table A.2."""
+NEVER_TOUCHED = ("skull_forehead", "face")
+"""Regions for which the table has no transient limit: contact there is to be prevented."""
 
 
 class Meeting(NamedTuple):
@@ -128,9 +147,10 @@ def _measure_pair(pair: tuple[str, bool], count: int, seed: int) -> dict[Reactio
 
 
 def limit_N(region: str, is_clamped: bool) -> float | None:
-    """Return the standard's limit of the force."""
-    row = BODY_REGIONS[region]
-    return row.force_N if is_clamped else row.transient_force_N
+    """Return the standard's limit of the force; None without one."""
+    if is_clamped:
+        return QUASI_STATIC_N[region]
+    return None if region in NEVER_TOUCHED else TRANSIENT_FACTOR * QUASI_STATIC_N[region]
 
 
 def worse(harms: Harms) -> list[str]:

@@ -20,7 +20,6 @@ from adacd_hil.cli.connection import (
     make_clock,
     may_be_hardware,
     never_stopped,
-    on_interrupt,
 )
 from adacd_hil.cli.console_operator import ConsoleOperator
 from adacd_hil.cli.output import CommandError, ExitCode, exit_code, is_terminal, quoted, run_folder, text_of
@@ -41,6 +40,7 @@ from adacd_hil.records import FaultReason
 from adacd_hil.scheme.identify.anchor import unanchored_joints
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
+from adacd_hil.terminal import on_interrupt
 from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.can_interface import CanInterface

@@ -4,7 +4,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.cli.connection import Connection, on_interrupt
+from adacd_hil.cli.connection import Connection
 from adacd_hil.cli.output import CommandError, ExitCode, tell
 from adacd_hil.clock import REALTIME, MonotonicClock, wall_ns
 from adacd_hil.control.pacing import prepare_spin
@@ -34,6 +34,7 @@ from adacd_hil.records import FaultReason
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_text import to_toml
+from adacd_hil.terminal import on_interrupt
 from adacd_hil.wire.bus import BusError, Tap
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_attributes import read_bitrates

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from adacd_hil.cli.connection import Connection, on_interrupt, raise_interrupt
+from adacd_hil.cli.connection import Connection, raise_interrupt
 from adacd_hil.cli.output import ExitCode, format_table, is_terminal
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.lab.commission.arm_checks import ARM_CHECKS, ArmExamination
@@ -19,6 +19,7 @@ from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import request_realtime
 from adacd_hil.settings.configuration_files import configuration_layers
+from adacd_hil.terminal import on_interrupt
 from adacd_hil.wire.can_interface import InterfaceState, read_link
 from adacd_hil.wire.contract_attributes import read_bitrates
 from adacd_hil.wire.open_bus import open_bus

@@ -5,7 +5,6 @@ import struct
 from collections import deque
 from typing import Any
 
-from adacd_hil.cli.connection import on_interrupt
 from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.lab.cli.monitor_command import show_tables
@@ -25,6 +24,7 @@ from adacd_hil.records import (
     Location,
     SchemeState,
 )
+from adacd_hil.terminal import on_interrupt
 
 TOPICS = (SCHEME.name, CYCLE.name, CONTACT.name, EVENTS.name)
 _BAR_WIDTH = 40

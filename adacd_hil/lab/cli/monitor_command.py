@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from adacd_hil.cli.connection import Connection, on_interrupt
+from adacd_hil.cli.connection import Connection
 from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.lab.commission.survey import BusView
@@ -14,7 +14,7 @@ from adacd_hil.lab.commission.traffic import receive_until
 from adacd_hil.lab.stated_bounds import PLAIN_S
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import plain
-from adacd_hil.terminal import fold, moves_cursor, terminal_columns, write_screen
+from adacd_hil.terminal import fold, moves_cursor, on_interrupt, terminal_columns, write_screen
 from adacd_hil.wire.bus import Bus, BusError, Frame
 from adacd_hil.wire.can_interface import carried_frames, read_link
 from adacd_hil.wire.codec import Codec

@@ -22,6 +22,7 @@ from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explain
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.lab.cli.log_command import dbc_option, find_dbc
 from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.terminal import on_interrupt
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.can_interface import is_virtual
 
@@ -192,7 +193,6 @@ def _run(
     the exit status: INTERRUPTED, PARTIAL for a damaged recording, FAILURE if no frame was sent, else OK. Raises
     LogError if the recording can't be read, CommandError if the bus fails.
     """
-    from adacd_hil.cli.connection import on_interrupt
     from adacd_hil.lab.logs.playback import LATE_MS, repeat
     from adacd_hil.lab.logs.playback import play as play_frames
 

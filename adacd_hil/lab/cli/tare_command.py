@@ -4,7 +4,7 @@ import signal
 from contextlib import closing
 from pathlib import Path
 
-from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, never_stopped, on_interrupt
+from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, never_stopped
 from adacd_hil.cli.output import CommandError, ExitCode, text_of
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.tare_file import Tare, read_tare, write_tare
@@ -16,6 +16,7 @@ from adacd_hil.lab.commission.tare import TareRefusedError
 from adacd_hil.lab.commission.tare_session import TareSession
 from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.setting_keys import apply_settings
+from adacd_hil.terminal import on_interrupt
 
 
 def as_text(tare: Tare, path: Path, backup: Path | None) -> str:

@@ -24,6 +24,7 @@ from adacd_hil.clock import MonotonicClock
 from adacd_hil.extras import install_command
 from adacd_hil.log.log_files import LogError
 from adacd_hil.settings.schema import ConfigError
+from adacd_hil.terminal import handling
 
 TLS = "tls://"
 TIMEOUT_S = 10
@@ -99,7 +100,7 @@ class ProcessWorkers:
         self._pool = self._open()
 
     def _open(self) -> ProcessPoolExecutor:
-        with _ignoring_interrupts():  # as do the processes that it forks, from their first moment
+        with handling(signal.SIG_IGN, signal.SIGINT):  # as do the processes that it forks, from their first moment
             forkserver.ensure_running()
         return ProcessPoolExecutor(self.room, self._context, initializer=_begin)
 
@@ -135,15 +136,6 @@ class ProcessWorkers:
 
 Workers = DaskWorkers | ProcessWorkers
 """Processes that compute, wherever they are. room: tasks that may be with them at a time."""
-
-
-@contextlib.contextmanager
-def _ignoring_interrupts() -> Iterator[None]:
-    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
 
 
 def _begin() -> None:
