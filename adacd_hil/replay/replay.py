@@ -40,7 +40,7 @@ from adacd_hil.replay.scheme_comparison import (
 )
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.scheme.pipeline.pipeline import Pipeline, SchemeBatch
-from adacd_hil.score.emulator_truth import KnownContacts, contacts_beside
+from adacd_hil.score.emulator_truth import KnownTruth, contacts_beside
 from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
 
@@ -102,7 +102,7 @@ class _Player:
     def __init__(
         self,
         settings: Settings,
-        truth: KnownContacts | None,
+        truth: KnownTruth | None,
         comparison: SchemeComparison | None,
         asking: Asking | None,
         checks_arms: bool,
@@ -208,7 +208,7 @@ def _joined(batches: Sequence[SchemeBatch]) -> SchemeBatch:
 def replay_source(
     source: ReplaySource,
     variants: Sequence[Settings],
-    truth: KnownContacts | None = None,
+    truth: KnownTruth | None = None,
     progress: Progress = lambda _: None,
     tolerance: float | None = None,
     script_of: ScriptOf | None = None,

@@ -20,7 +20,7 @@ from adacd_hil.log.logged_run import Mismatch, begins_alarm, host_span, is_armed
 from adacd_hil.records import JOINTS, LEARNING, PARAMETER_UNITS, FaultReason, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.score.distribution import Distribution
-from adacd_hil.score.emulator_truth import HostCycles, KnownContacts, placed_contacts
+from adacd_hil.score.emulator_truth import HostCycles, KnownTruth, placed_contacts
 from adacd_hil.score.judge import Detection, Score, TrueContact, is_about_weight, judge
 from adacd_hil.score.smallest_push import PUSH_WITHIN, PushGatherer
 from adacd_hil.score.wording import NONE, found_text, why_not_found
@@ -51,7 +51,7 @@ class OutcomeGatherer:
     `truth`: the true contacts, None if unknown. behind_gap_ns, detections_ns: times of alarms, ns.
     """
 
-    def __init__(self, settings: Settings, truth: KnownContacts | None) -> None:
+    def __init__(self, settings: Settings, truth: KnownTruth | None) -> None:
         self.transitions: list[StateChange] = []
         self.adaptations: list[tuple[int, float | None]] = []  # beginning, ns; duration, s, None: never in MONITOR
         self.theta_hat: tuple[float, ...] = ()

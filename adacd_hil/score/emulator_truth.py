@@ -325,7 +325,7 @@ def threshold_in_force(threshold: Vector, settings: Settings) -> Vector:
     return np.where(np.isfinite(threshold), threshold, settings.detector.threshold_Nm)
 
 
-class KnownContacts(NamedTuple):
+class KnownTruth(NamedTuple):
     """The true contacts of a run, in order, of which cycles they are known, and the rows of the truth."""
 
     contacts: tuple[TrueContact, ...]
@@ -333,7 +333,7 @@ class KnownContacts(NamedTuple):
     rows: Truth
 
 
-def contacts_beside(path: Path, progress: Progress = lambda _: None) -> KnownContacts | None:
+def contacts_beside(path: Path, progress: Progress = lambda _: None) -> KnownTruth | None:
     """Return what truth.mcap beside a log knows of the true contacts of its run.
 
     None without that file, if the emulator never cycled, and for a truth of another run or one whose heads can't be
@@ -346,4 +346,4 @@ def contacts_beside(path: Path, progress: Progress = lambda _: None) -> KnownCon
         progress(f"{problem}; it is left out")
         return None
     table = read_truth(truth)
-    return None if table.span is None else KnownContacts(true_contacts(table.rows), table.span, table.rows)
+    return None if table.span is None else KnownTruth(true_contacts(table.rows), table.span, table.rows)

@@ -29,7 +29,7 @@ from adacd_hil.log.time_window import WHOLE
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.replay.replayed_outcome import OutcomeGatherer
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
-from adacd_hil.score.emulator_truth import KnownContacts
+from adacd_hil.score.emulator_truth import KnownTruth
 from adacd_hil.score.judge import filtered
 
 SETTLING_ROWS = 1000
@@ -47,7 +47,7 @@ def upright(run):
 def replayed(run, cut):
     """Return the score of a replay that comes to the states of a run, in two pieces."""
     truth = (), ((0, 0), (0, len(run.cycle) + FIRST_CYCLE)), run.truth
-    gatherer = OutcomeGatherer(run.settings, KnownContacts(*truth))
+    gatherer = OutcomeGatherer(run.settings, KnownTruth(*truth))
     gatherer.begin_attempt(0, FIRST_CYCLE)
     previous = np.concatenate(([SchemeState.INIT], run.state[:-1]))
     for rows in (slice(0, cut), slice(cut, None)):

@@ -33,7 +33,7 @@ from adacd_hil.lab.thresholds.recorded_thresholds import (
 from adacd_hil.log.log_files import LogError
 from adacd_hil.plain_values import plain_values
 from adacd_hil.records import SchemeState
-from adacd_hil.score.emulator_truth import KnownContacts
+from adacd_hil.score.emulator_truth import KnownTruth
 from adacd_hil.score.judge import TrueContact
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import read_toml
@@ -166,7 +166,7 @@ TOUCH = TrueContact(number=1, link=1, cycle=np.array([4990, 5020]), tau_ext=np.f
 def test_an_alarm_stands_for_a_contact_unless_the_truth_says_that_nobody_was_there(
     monkeypatch, truth, free, false_alarms
 ):
-    known = None if truth is None else KnownContacts(truth, ((0, 0), (0, 9999)), None)
+    known = None if truth is None else KnownTruth(truth, ((0, 0), (0, 9999)), None)
     monkeypatch.setattr(module, "contacts_beside", lambda *_: known)
     monkeypatch.setattr(module, "logged_settings", lambda _: Settings())
     reacts = {"state": between(5000, 6300, SchemeState.REACT), "contact_joints": between(5000, 5010, 2)}

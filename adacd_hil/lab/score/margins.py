@@ -22,7 +22,7 @@ import numpy as np
 
 from adacd_hil.lab.score.metrics import (
     Beside,
-    BesideContact,
+    BesideDetection,
     CertifiedEvidence,
     ChannelMargin,
     ParameterEstimate,
@@ -118,7 +118,7 @@ class BesideGatherer:
             adaptation_s={label: self._adaptation_s.get(label) for label in learnt},
             frozen_residual_max_Nm={label: _pair(self._largest.get(label)) for label in watched},
             contacts=tuple(
-                BesideContact(
+                BesideDetection(
                     contact.number,
                     contact.is_armed,
                     None if contact.detected_ns is None else (contact.detected_ns - run.zero_ns) * 1e-9,

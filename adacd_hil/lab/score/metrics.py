@@ -129,8 +129,8 @@ class CyclicData:
     excesses: tuple[str, ...]
 
 
-class BesideContact(NamedTuple):
-    """What the paper's scheme beside made of a true contact; number: as in the list of contacts.
+class BesideDetection(NamedTuple):
+    """The detection of a true contact by the paper's scheme beside; number: as in the list of contacts.
 
     detected_s: s since motion start; it and the delay are None if no crossing found the contact.
     """
@@ -151,7 +151,7 @@ class Beside:
 
     adaptation_s: dict[str, float | None]
     frozen_residual_max_Nm: dict[str, tuple[float, float] | None]
-    contacts: tuple[BesideContact, ...]
+    contacts: tuple[BesideDetection, ...]
     false_alarms: int | None
     false_alarms_s: tuple[float, ...] | None
     missed: int | None

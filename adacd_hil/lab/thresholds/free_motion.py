@@ -40,7 +40,7 @@ from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.kernel.kernel_samples import LONGEST_SHARE, SHORTEST_SHARE
-from adacd_hil.score.emulator_truth import HostCycles, KnownContacts, contacts_beside, placed_contacts
+from adacd_hil.score.emulator_truth import HostCycles, KnownTruth, contacts_beside, placed_contacts
 from adacd_hil.score.judge import Detection, TrueContact, explained_times, judge
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.setting_keys import changed_keys
@@ -208,7 +208,7 @@ def _judged(
     is_sound: Mask,
     cycles: HostCycles,
     alarms: Sequence[int],
-    truth: KnownContacts,
+    truth: KnownTruth,
     begins: Sequence[int],
     settings: Settings,
 ) -> LoggedMotion:
