@@ -10,7 +10,7 @@ from rig import CycleRig, Rig, SessionRig, scripted
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.log.reader import RunLog
 from adacd_hil.log.types.topics import DECODED
-from adacd_hil.records import FaultReason, SchemeState
+from adacd_hil.records import Event, FaultReason, SchemeState
 from adacd_hil.settings.parsing import parse
 from adacd_hil.wire.bus import BusError, Frame
 from firmware_sim.scenario.scenario import Scenario
@@ -148,8 +148,8 @@ class _Watched(Rig):
             self.wire.append((self.host_cycle, can_id))
         super().deliver(can_id, data)
 
-    def _on_event(self, _t_ns: int, _level: str, _name: str, text: str) -> None:
-        self.edges.append((self.host_cycle, text))
+    def _on_event(self, _t_ns: int, event: Event) -> None:
+        self.edges.append((self.host_cycle, event.message))
 
     def _on_truth(self, _cycle: int, _t_ns: int, block: Any) -> None:
         self.masks.append(int(block[-1]))

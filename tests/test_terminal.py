@@ -21,6 +21,7 @@ from adacd_hil.lab.cli.monitor_command import Screen
 from adacd_hil.log.reader import read_log
 from adacd_hil.printable import in_line, one_line, plain
 from adacd_hil.progress_lines import Progress
+from adacd_hil.records import Event
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import Terminal, for_people, has_colour, terminal_columns
 from firmware_sim.bench.bench_time import TruthLog
@@ -98,7 +99,7 @@ def test_a_name_reaches_a_terminal_as_plain_text(
 ) -> None:
     (tmp_path / EVIL).mkdir()
     with TruthLog(tmp_path / EVIL / "truth.mcap", blocking=True) as log:
-        log.write_event(0, "info", "run", "begun")
+        log.event(0, Event("info", "run", "begun"))
     ours, theirs = os.openpty()
     program, *rest = (word.replace("EVIL", EVIL) for word in words)
     environment = {**os.environ, "NO_COLOR": "1"}  # else our own colours are escape sequences, too

@@ -141,7 +141,7 @@ def run_embedded(
                     embedded.deliver,
                     contract=contract,
                     on_truth=write_truth,
-                    on_event=truth.write_event,
+                    on_event=truth.event,
                 )
                 new_pipeline(settings).compile_cycle()
             embedded.attach(bench.on_frame)

@@ -59,7 +59,7 @@ class Bench:
         lost by a fault; also for periods that pass by the clock until the arm rests, in "wall" from the fourth after a
         SYNC on. t_ns is the time of the SYNC frame, in lockstep the host's, and the block is valid until the next call.
         contract: which EDS files the devices have; default: those that go with the codec's DBC. on_event: called with
-        t_ns, level, name and text when a fault begins or ends. arm: None: a body of the scenario's.
+        t_ns and an event when a fault begins or ends. arm: None: a body of the scenario's.
 
         Raises ConfigError when a fault doesn't fit the contract or its device, as `find_frames` and `check_objects`;
         CodecError when the DBC lacks a message; OSError when an EDS can't be read.

@@ -25,7 +25,7 @@ import numpy as np
 from adacd_hil.log.log_files import SCENARIO_NAME, find_parts
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.truth_topic import TRUTH, TRUTH_LAYOUT, truth_channels
-from adacd_hil.records import Event, Vector
+from adacd_hil.records import Vector
 from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.time_marks import NEVER_NS, MarkKind, unpack_mark
 from firmware_sim.bench.bench_nodes import TICK_NS, BenchNodes
@@ -81,11 +81,10 @@ class TruthLog(Recorder):
         path: Path,
         *,
         blocking: bool,
-        epoch_ns: int = 0,
         metadata: Mapping[str, str] | None = None,
         scenario: Scenario | None = None,
     ) -> None:
-        """Create the file. `blocking`: wait for the writer rather than lose a cycle. epoch_ns: added to all times.
+        """Create the file. `blocking`: wait for the writer rather than lose a cycle.
 
         scenario: attached, and its faults and truth are named in the metadata.
 
@@ -101,7 +100,6 @@ class TruthLog(Recorder):
                 **truth,
                 **{f"fault_{index}": row.timed_text for index, row in enumerate(faults)},
             },
-            epoch_ns=epoch_ns,
             blocking=blocking,
             messages=(),
             channels=truth_channels(),
@@ -110,17 +108,9 @@ class TruthLog(Recorder):
     def write(self, cycle: int, t_ns: int, block: Vector) -> None:
         """Log the truth of one cycle; `block` is laid out by TRUTH_LAYOUT.
 
-        t_ns: without the log's epoch. With a full ring it waits if the log is `blocking`, else it drops and counts the
-        cycle.
+        With a full ring it waits if the log is `blocking`, else it drops and counts the cycle.
         """
         self.cycle(t_ns, ((TRUTH.id, TRUTH.pack(cycle, block=block)),))
-
-    def write_event(self, t_ns: int, level: str, name: str, text: str) -> None:
-        """Log the beginning or end of a fault as an event. `level`: info, warning or error.
-
-        t_ns: without the log's epoch. With a full ring it waits or drops the event as `write` does.
-        """
-        self.event(t_ns, Event(level, name, text))
 
     def discard(self) -> None:
         """Close the log and delete all its parts. Raises OSError if one can't be deleted."""

@@ -13,7 +13,7 @@ import heapq
 import itertools
 from collections.abc import Callable, Sequence
 
-from adacd_hil.records import JOINTS
+from adacd_hil.records import JOINTS, Event
 from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import DEVICE_MARK, NEVER_NS, MarkKind, pack_mark
@@ -122,8 +122,8 @@ class Departure:
 
 
 Handler = Callable[[bytes, int], None]
-OnEvent = Callable[[int, str, str, str], None]
-"""Called with t_ns, level, name, text."""
+OnEvent = Callable[[int, Event], None]
+"""Called with t_ns and the event."""
 
 
 class Injector:
@@ -132,7 +132,7 @@ class Injector:
     def __init__(self, scenario: Scenario, codec: Codec, outbox: Outbox, on_event: OnEvent | None) -> None:
         """Begin before power-on. Raises ConfigError for a fault that doesn't fit the contract, as `find_frames`.
 
-        on_event: called with t_ns, level, name and text when a fault begins or ends; None: it isn't.
+        on_event: called with t_ns and an event when a fault begins or ends; None: it isn't.
         """
         first, second = (count_Nm(scenario.sensors, joint) for joint in scenario.arm.wiring.sensor_joint)
         self.plan = FaultPlan(scenario.faults, scenario.seed, codec, (first, second))
@@ -205,7 +205,7 @@ class Injector:
         scenario_ns = -1 if self._started_ns is None else now_ns - self._started_ns
         for event in self.plan.advance(scenario_ns, now_ns - self._power_on_ns):
             if self.on_event is not None:
-                self.on_event(stamp_ns, *event)
+                self.on_event(stamp_ns, event)
         for action in self.plan.actions():
             self._do(action, now_ns)
         if self._is_acknowledged != self.plan.is_acknowledged:

@@ -315,7 +315,7 @@ def _log_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> None:
         return t_ns if bench.is_paced else t_ns + epoch_ns
 
     bench.rows.on_truth = lambda cycle, t_ns, block: truth.write(cycle, stamp(t_ns), block)
-    bench.injector.on_event = lambda t_ns, *event: truth.write_event(stamp(t_ns), *event)
+    bench.injector.on_event = lambda t_ns, event: truth.event(stamp(t_ns), event)
 
 
 def _serve(service: Service) -> None:

@@ -7,6 +7,7 @@ the bench's time; a device and its application exchange times of the device's ow
 
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
+from functools import partial
 from typing import Protocol
 
 from adacd_hil.records import Vector
@@ -68,10 +69,7 @@ class Application:
         """Do nothing; subclasses react to entering Operational. PDOs are exchanged already."""
 
     def lose_heartbeat(self, t_ns: int) -> None:
-        """Do nothing; subclasses react to the loss of the master's heartbeat, before the device leaves Operational."""
-
-    def find_heartbeat(self, t_ns: int) -> None:
-        """Do nothing; subclasses react to the return of the master's heartbeat."""
+        """Do nothing; subclasses react to the loss of the master's heartbeat, before its watchdog trips."""
 
     def distrust_sync(self, t_ns: int) -> None:
         """Do nothing; subclasses react to more than TOLERATED SYNCs that were repeated, early or out of sequence."""
@@ -150,7 +148,9 @@ class EmulatedDevice(ObjectDictionary):
         self._put_on_bus = send
         self._application = Application()
         self._producer = HeartbeatProducer(self, self._send, lambda: self.state, lambda: self.now_ns)
-        self._consumer = HeartbeatConsumer(self, self.lose_heartbeat, self.find_heartbeat, lambda: self.now_ns)
+        self._consumer = HeartbeatConsumer(
+            self, self.lose_heartbeat, partial(self.clear, Watchdog.HEARTBEAT), lambda: self.now_ns
+        )
         self._errors = ErrorReporter(self, self._send, lambda: self.error_register, lambda: self.state in _EMCY_STATES)
         self.tripped = self._errors.tripped
         """Watchdogs that are tripped now."""
@@ -285,17 +285,14 @@ class EmulatedDevice(ObjectDictionary):
             self._consumer.on_heartbeat(node_id, self.clock.own_ns(t_ns))
 
     def lose_heartbeat(self, t_ns: int) -> None:
-        """React to the master's silence: call the application, then leave Operational (CiA 301, default of 0x1029).
+        """React to the master's silence: call the application, trip the watchdog, leave Operational.
 
-        t_ns: the device's own time.
+        The latter is the default of 0x1029 (CiA 301). t_ns: the device's own time.
         """
         self._application.lose_heartbeat(t_ns)
+        self.trip(Watchdog.HEARTBEAT, t_ns)
         if self.is_operational:
             self._enter(NmtState.PRE_OPERATIONAL, t_ns)
-
-    def find_heartbeat(self, t_ns: int) -> None:
-        """Report the return of the master's heartbeat to the application. t_ns: the device's own time."""
-        self._application.find_heartbeat(t_ns)
 
     def note_sync(self, kind: SyncKind, lost: int, t_ns: int) -> None:
         """Count a SYNC and the `lost` ones before it; trip or clear the watchdogs SYNC_ORDER and SYNC_LENGTH.

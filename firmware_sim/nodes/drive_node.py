@@ -335,15 +335,9 @@ class DriveNode(Application):
         self._find_command_pdo(t_ns)
 
     def lose_heartbeat(self, t_ns: int) -> None:
-        """Latch a fault in Operation enabled or Quick stop active; in other states only trip the watchdog."""
+        """Latch a fault in Operation enabled or Quick stop active; in other states do nothing."""
         if self.state in _POWERED:
             self._fault(Watchdog.HEARTBEAT, t_ns, is_found_by_time=True)
-        else:
-            self.device.trip(Watchdog.HEARTBEAT, t_ns)
-
-    def find_heartbeat(self, t_ns: int) -> None:
-        """Clear the heartbeat watchdog; a fault stays latched."""
-        self.device.clear(Watchdog.HEARTBEAT, t_ns)
 
     def distrust_sync(self, t_ns: int) -> None:
         """Latch a fault in Operation enabled: torque acts at SYNC, which is no time base any more."""

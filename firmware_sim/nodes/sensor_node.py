@@ -13,7 +13,6 @@ import math
 from collections.abc import Callable
 
 from adacd_hil.wire.codec import Codec
-from firmware_sim.canopen.error_control import Watchdog
 from firmware_sim.canopen.object_dictionary import Abort, refuse
 from firmware_sim.nodes.device import Application, EmulatedDevice
 
@@ -116,14 +115,6 @@ class SensorNode(Application):
             self.has_news = False
             self._pdos.notify()
         return clock.bench_ns(min(due_ns, self._pdos.poll(t_ns)))
-
-    def lose_heartbeat(self, t_ns: int) -> None:
-        """Trip the heartbeat watchdog, which sends an EMCY."""
-        self.device.trip(Watchdog.HEARTBEAT, t_ns)
-
-    def find_heartbeat(self, t_ns: int) -> None:
-        """Clear the heartbeat watchdog, which sends an EMCY with code 0."""
-        self.device.clear(Watchdog.HEARTBEAT, t_ns)
 
     def note_error(self) -> None:
         """Set `has_news`: the error register may have changed, so the next `poll` sends the status frame."""

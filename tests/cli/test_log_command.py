@@ -7,6 +7,7 @@ from called import called
 from log.made_log import SUMMARY, make_log
 from log.recorded_run import make_run, record
 
+from adacd_hil.records import Event
 from firmware_sim.bench.bench_time import TruthLog
 
 WHOLE = make_log()
@@ -140,7 +141,7 @@ def test_what_a_log_says_stays_within_its_line(tmp_path):
 
 def test_events_of_a_log_stay_within_their_line(tmp_path):
     with TruthLog(tmp_path / "truth.mcap", blocking=True) as log:
-        log.write_event(0, "error", "arm", "fell\nproblem: none")
+        log.event(0, Event("error", "arm", "fell\nproblem: none"))
     (line,) = [line for line in call("info", tmp_path)[1].splitlines() if "fell" in line]
     assert line == "  error: arm: fell\\u000aproblem: none"
 

@@ -10,6 +10,7 @@ from long_cases import long_but
 from shown_terminal import Shown, show_on_terminal
 
 from adacd_hil.cli.main import cli as host
+from adacd_hil.records import Event
 from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.cli.emulator_main import cli as emulator
 
@@ -102,7 +103,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made: Path = tmp_path_factory.mktemp("terminal")
     (made / "mine.toml").write_text(CONFIGURATION)
     with TruthLog(made / "truth.mcap", blocking=True) as log:
-        log.write_event(0, "info", "run", "begun")
+        log.event(0, Event("info", "run", "begun"))
     return made
 
 

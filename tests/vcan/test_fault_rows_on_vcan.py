@@ -58,7 +58,7 @@ def embedded(played: Played, tmp_path_factory: pytest.TempPathFactory) -> Path:
     settings = load_settings(str(files / "settings.toml"))
     scenario = load_scenario(str(files / "scenario.toml"))
     with TruthLog(folder / TRUTH_NAME, blocking=True, scenario=scenario) as truth:
-        watched = {"on_truth": truth.write, "on_event": truth.write_event}
+        watched = {"on_truth": truth.write, "on_event": truth.event}
         SessionRig(folder, settings, scenario, is_modelled=True, **watched).session.run()
     return folder
 
