@@ -172,6 +172,8 @@ class Drive(CyclicDevice):
         self.is_enabled = False
         """Whether the drive produces the commanded torque."""
         self.torque_actual_permille = 0
+        self.torque_cycle = -1
+        """Cycle of the last frame with the actual torque; -1 before the first."""
         self.error_code = 0
 
     def fault(self, cycle: int, is_enabled: bool) -> FaultReason:
@@ -196,11 +198,6 @@ class Drive(CyclicDevice):
 
     def _use_status(self, values: Sequence[float], cycle: int) -> None:
         self._take_status(values, self._status_places, cycle)
-
-    @property
-    def shows_torque(self) -> bool:
-        """Whether some frame carries the actual torque, 0x6077."""
-        return max(self._feedback_status.torque_actual, self._status_places.torque_actual) >= 0
 
     @property
     def is_limited(self) -> bool:
@@ -233,6 +230,7 @@ class Drive(CyclicDevice):
         self.is_enabled = self.state is Cia402State.OPERATION_ENABLED and self.mode == MODE_CYCLIC_SYNCHRONOUS_TORQUE
         if at.torque_actual >= 0:
             self.torque_actual_permille = int(values[at.torque_actual])
+            self.torque_cycle = cycle
         if at.error_code >= 0:
             self.error_code = int(values[at.error_code])
 

@@ -3,11 +3,15 @@
 import dataclasses
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 from loaded import loaded_contract
 
 import adacd_hil
+from adacd_hil.control.fault_recovery import SelfChecks
 from adacd_hil.device.device_files import load_profile
 from adacd_hil.device.drive import (
     IMPLAUSIBLE_JUMP_RAD,
@@ -18,7 +22,7 @@ from adacd_hil.device.drive import (
     option_codes,
     torque_limit_permille,
 )
-from adacd_hil.records import FaultReason
+from adacd_hil.records import FaultReason, Request, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
@@ -363,6 +367,7 @@ signals = [
 STATUS = '{ object = "0x6041", signal = "statusword" }, '
 MODE = '{ object = "0x6061", signal = "mode_display" }, { object = "0x1001", signal = "error_register" }'
 ERROR = '{ object = "0x603F", signal = "error_code" }'
+TORQUE = '{ object = "0x6077", signal = "torque_actual" }, '
 
 
 def test_the_status_may_travel_in_the_feedback(tmp_path: Path) -> None:
@@ -372,7 +377,7 @@ def test_the_status_may_travel_in_the_feedback(tmp_path: Path) -> None:
     assert arm.accept_cyclic(frame, 7)
     assert (arm.state, arm.mode, arm.status_cycle) == (Cia402State.OPERATION_ENABLED, 10, 7)
     assert (arm.has_status_frame, arm.status_message, arm.is_enabled) == (False, None, True)
-    assert (arm.torque_actual_permille, arm.error_code, arm.shows_torque) == (0, 0, False)
+    assert (arm.torque_actual_permille, arm.error_code, arm.torque_cycle) == (0, 0, -1)
 
 
 @pytest.mark.parametrize("first", ["mode_display", "torque_actual", "error_code"])
@@ -386,21 +391,35 @@ def test_a_signal_of_the_status_may_be_the_first_of_its_frame(tmp_path: Path, fi
     assert arm.state is Cia402State.OPERATION_ENABLED
     kept = {"mode_display": 10, "torque_actual": 0, "error_code": 0} | {first: raw[first]}
     assert (arm.mode, arm.torque_actual_permille, arm.error_code) == tuple(kept.values())
-    assert arm.shows_torque is (first == "torque_actual")
+    assert arm.torque_cycle == (2 if first == "torque_actual" else -1)
 
 
 def test_the_status_may_travel_in_both_frames(tmp_path: Path) -> None:
-    torque = '{ object = "0x6077", signal = "torque_actual" }, '
-    codec = wide_contract(tmp_path, torque + MODE, status=STATUS + ERROR)
+    codec = wide_contract(tmp_path, TORQUE + MODE, status=STATUS + ERROR)
     arm, feedback = drive(codec), codec.message("Drive1Feedback")
     assert arm.status_message is not None
     arm.accept_status(bytes(arm.status_message.encode(0x0237, 0x8130)), 2)
     assert arm.accept_cyclic(bytes(feedback.encode(0.5, 1.0, -7, 10, 0x81)), 3)
     assert (arm.state, arm.statusword, arm.mode) == (Cia402State.OPERATION_ENABLED, 0x0237, 10)
     arm.accept_status(bytes(arm.status_message.encode(0x0237, 0x8131)), 4)
-    assert (arm.torque_actual_permille, arm.error_code, arm.shows_torque) == (-7, 0x8131, True)
+    assert (arm.torque_actual_permille, arm.error_code, arm.torque_cycle) == (-7, 0x8131, 3)
     assert arm.accept_cyclic(bytes(feedback.encode(0.5, 0.0, -8, 10, 0x81)), 5)
     assert (arm.torque_actual_permille, arm.error_code, arm.status_cycle) == (-8, 0x8131, 5)
+
+
+def test_a_wrong_torque_counts_once_however_often_the_feedback_brings_the_mode(tmp_path: Path) -> None:
+    codec = wide_contract(tmp_path, f"{MODE}, {ERROR}", status=TORQUE + STATUS)
+    drives = [drive(codec), Drive(codec, 2, PERIOD_S)]
+    settings = load_settings("stock")
+    parts: Any = SimpleNamespace(drives=drives, limits=settings.arm, first_difference="", line="")
+    checks = SelfChecks(settings, parts, parts, np.zeros(2), parts)
+    requests = []
+    for cycle in range(101):
+        if cycle % 100 == 0:
+            drives[0].accept_status(bytes(codec.message("Drive1Status").encode(700, 0x0237)), cycle)
+        drives[0].accept_cyclic(bytes(codec.message("Drive1Feedback").encode(0.5, 0.0, 10, 0, 0)), cycle)
+        requests.append(checks.judge(SimpleNamespace(cycle=cycle, is_enabled=True), SchemeState.ENABLE))  # type: ignore[arg-type]
+    assert requests == [Request.NONE] * 100 + [Request.FAULT_TORQUE]
 
 
 def test_an_implausible_frame_changes_no_status_either(tmp_path: Path) -> None:
