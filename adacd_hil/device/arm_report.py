@@ -212,7 +212,7 @@ def describe_faults(arm: Arm) -> list[str]:
     for drive in arm.drives:
         ages.append((f"{drive.name}: position, velocity", drive.sample_cycle, arm.max_age_cycles))
         if drive.has_status_frame:
-            ages.append((f"{drive.name}: statusword", drive.status_cycle, drive.status_age_limit))
+            ages.append((f"{drive.name}: status", drive.status_cycle, drive.status_age_limit))
     ages += ((f"{sensor.name}: torque", sensor.sample_cycle, arm.max_age_cycles) for sensor in arm.sensors)
     lines += (
         f"{signals} {arm.cycle - cycle} cycles old, {limit:g} allowed"

@@ -48,7 +48,8 @@ class CyclicDevice(ABC):
         self._status_bounds: tuple[ValueBound, ...] = ()
         self._cyclic_values: Sequence[float] = ()
         self._status_values: Sequence[float] = ()
-        self._status_came: float = -math.inf  # cycle of the last status frame
+        self.status_cycle = -1
+        """Cycle of the last status frame; -1 before the first."""
 
     def set_bounds(self, placed: PlacedDevice) -> None:
         """Take over the bounds of values and the period of the status from the device's profile.
@@ -98,7 +99,7 @@ class CyclicDevice(ABC):
             return False
         is_valid = receiver.check(data).is_valid
         if is_valid:
-            self._status_values, self._status_came = message.decode_values(data), cycle
+            self._status_values, self.status_cycle = message.decode_values(data), cycle
             self._use_status(self._status_values, cycle)
         return is_valid
 
@@ -122,7 +123,8 @@ class CyclicDevice(ABC):
         return [f"{self.name}: {bound.describe(values)}" for bound, values in self._excesses()]
 
     def _is_status_old(self, cycle: int) -> bool:
-        return bool(self._status_bounds) and cycle - self._status_came > self.status_age_limit
+        is_old = not self._status_values or cycle - self.status_cycle > self.status_age_limit
+        return bool(self._status_bounds) and is_old
 
     def _excesses(self) -> Iterator[tuple[ValueBound, Sequence[float]]]:
         """Yield (bound, values of its frame) for each bounded value outside its bounds in the newest valid frame."""

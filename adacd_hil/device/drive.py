@@ -155,16 +155,15 @@ class Drive(CyclicDevice):
         self._command, self._controlword_at, self._torque_at = _command_template(
             self._command_message, max_torque_permille
         )
-        self.has_status_frame = self._feedback_status == _NO_STATUS
-        """Whether the status comes in a frame of its own."""
+        deciding = zip(self._feedback_status[:2], self._status_places[:2], strict=True)
+        self.has_status_frame = any(own < 0 <= other for own, other in deciding)
+        """Whether statusword or mode, which decide whether the drive is enabled, come in a status frame alone."""
         if max(self._feedback_status.statusword, self._status_places.statusword) < 0:
             raise CodecError(f"{name}: no message carries signal statusword")
         self._last_controlword = Controlword.DISABLE_VOLTAGE
         self.recent_permille: deque[int] = deque([0], maxlen=_RECENT_COMMANDS)
         """Commanded torque of the last cycles, per mille of rated torque."""
         self.values = 0.0, 0.0  # position, rad, and velocity, rad/s
-        self.status_cycle = -1
-        """Cycle in which the status in use came; -1 before the first."""
         self.state = Cia402State.NOT_READY_TO_SWITCH_ON
         self.statusword = 0
         # If no frame shows the mode, the master has compared 0x6061 before the start, if `_enter_mode` could.
@@ -177,12 +176,13 @@ class Drive(CyclicDevice):
         self.error_code = 0
 
     def fault(self, cycle: int, is_enabled: bool) -> FaultReason:
-        """Return DATA_AGE if the drives are enabled (`is_enabled`) and the status is older than `status_age_limit`.
+        """Return DATA_AGE if the drives are enabled (`is_enabled`) and a needed status frame is too old.
 
-        Else DRIVE if a bounded value is outside its bounds, or a status with such values missing or too old; else NONE.
-        The drive's own FAULT state and `error_code` don't count here.
+        Needed: as of `has_status_frame`; too old: older than `status_age_limit`. Else DRIVE if a bounded value is
+        outside its bounds, or a status with such values missing or too old; else NONE. The drive's own FAULT state and
+        `error_code` don't count here.
         """
-        if is_enabled and cycle - self.status_cycle > self.status_age_limit:
+        if is_enabled and self.has_status_frame and cycle - self.status_cycle > self.status_age_limit:
             return FaultReason.DATA_AGE
         return FaultReason.DRIVE if self.has_excess(cycle) else FaultReason.NONE
 
@@ -193,8 +193,7 @@ class Drive(CyclicDevice):
     def _use(self, data: bytes, values: Sequence[float], cycle: int) -> None:  # noqa: ARG002 (as of all devices)
         self.values = values[self._main_at], values[self._velocity_at]
         self.sample_cycle = cycle
-        if not self.has_status_frame:
-            self._take_status(values, self._feedback_status, cycle)
+        self._take_status(values, self._feedback_status, cycle)
 
     def _use_status(self, values: Sequence[float], cycle: int) -> None:
         self._take_status(values, self._status_places, cycle)
@@ -221,7 +220,6 @@ class Drive(CyclicDevice):
 
         at: their places among `values`.
         """
-        self.status_cycle = cycle
         if at.statusword >= 0:
             self.statusword = int(values[at.statusword])
             self.state = decode_statusword(self.statusword)

@@ -176,7 +176,7 @@ def test_a_status_that_stays_away_from_an_enabled_drive_is_a_fault(cycle: int, f
     devices.arm.synchronise(cycle, 0, 1)
     devices.answer()
     assert devices.arm.state().fault is fault
-    said = [f"Drive{joint}: statusword {cycle} cycles old, 250 allowed" for joint in (1, 2)]
+    said = [f"Drive{joint}: status {cycle} cycles old, 250 allowed" for joint in (1, 2)]
     assert describe_faults(devices.arm) == (said if cycle > 250 else [])
 
 

@@ -300,7 +300,7 @@ def test_protected_feedback_brings_motion_and_status_and_lets_torque_pass() -> N
     assert command_of(seen.command(55, enable=True, quick_stop=False), FD) == (0, 0, 0, 321)
     assert seen.accept_cyclic(Sender().frame(), 7) is True
     assert seen.values == pytest.approx((0.25, -0.5), abs=1e-5)
-    assert (seen.sample_cycle, seen.status_cycle, seen.has_status_frame) == (7, 7, False)
+    assert (seen.sample_cycle, seen.torque_cycle, seen.has_status_frame) == (7, 7, False)
     assert (seen.state, seen.mode) == (Cia402State.OPERATION_ENABLED, 10)
     assert (seen.torque_actual_permille, seen.error_code) == (-120, 0x8130)
     assert command_of(seen.command(55, enable=True, quick_stop=False), FD) == (0x0F, 55, 0, 321)
@@ -375,7 +375,7 @@ def test_the_status_may_travel_in_the_feedback(tmp_path: Path) -> None:
     arm = drive(codec)
     frame = bytes(codec.message("Drive1Feedback").encode(2.5, 1.0, 0x0237, 10, 0x81))
     assert arm.accept_cyclic(frame, 7)
-    assert (arm.state, arm.mode, arm.status_cycle) == (Cia402State.OPERATION_ENABLED, 10, 7)
+    assert (arm.state, arm.mode, arm.sample_cycle) == (Cia402State.OPERATION_ENABLED, 10, 7)
     assert (arm.has_status_frame, arm.status_message, arm.is_enabled) == (False, None, True)
     assert (arm.torque_actual_permille, arm.error_code, arm.torque_cycle) == (0, 0, -1)
 
@@ -404,7 +404,34 @@ def test_the_status_may_travel_in_both_frames(tmp_path: Path) -> None:
     arm.accept_status(bytes(arm.status_message.encode(0x0237, 0x8131)), 4)
     assert (arm.torque_actual_permille, arm.error_code, arm.torque_cycle) == (-7, 0x8131, 3)
     assert arm.accept_cyclic(bytes(feedback.encode(0.5, 0.0, -8, 10, 0x81)), 5)
-    assert (arm.torque_actual_permille, arm.error_code, arm.status_cycle) == (-8, 0x8131, 5)
+    assert (arm.torque_actual_permille, arm.error_code, arm.status_cycle) == (-8, 0x8131, 4)
+
+
+@pytest.mark.parametrize(
+    ("cyclic", "status", "fault"),
+    [
+        (TORQUE + MODE, STATUS, FaultReason.DATA_AGE),
+        (TORQUE + STATUS, MODE, FaultReason.DATA_AGE),
+        (STATUS + MODE, TORQUE, FaultReason.NONE),  # it doesn't decide whether the drive is enabled
+    ],
+    ids=["statusword", "mode", "torque"],
+)
+def test_a_status_frame_that_stays_away_is_missed_whatever_the_feedback_brings(
+    tmp_path: Path, cyclic: str, status: str, fault: FaultReason
+) -> None:
+    codec = wide_contract(tmp_path, cyclic, status=status)
+    arm, raw = drive(codec), {"statusword": 0x0237, "mode_display": 10}
+    arm.status_age_limit = 40
+
+    def frame(name: str) -> bytes:
+        message = codec.message(name)
+        return bytes(message.encode(*(raw.get(signal.name, 0) for signal in message.values)))
+
+    arm.accept_status(frame("Drive1Status"), 3)
+    for cycle in range(3, 45):
+        assert arm.fault(cycle - 1, is_enabled=True) is FaultReason.NONE
+        arm.accept_cyclic(frame("Drive1Feedback"), cycle)
+    assert (arm.is_enabled, arm.fault(44, is_enabled=True)) == (True, fault)
 
 
 def test_a_wrong_torque_counts_once_however_often_the_feedback_brings_the_mode(tmp_path: Path) -> None:
