@@ -140,8 +140,6 @@ def _number(value: int) -> str:
 
 
 CST_SUPPORTED = 1 << 9  # of 0x6502
-_MODE_READS = 20
-"""A drive may take a few of its own cycles to show a new mode; an SDO takes 0.3 ms at 1 Mbit/s at the least."""
 
 
 def command_deadline_ms(settings: Settings) -> int:
@@ -291,10 +289,10 @@ _MODE_POLL_S = 0.02
 def _enter_mode(slave: Slave, codec: Codec) -> list[str]:
     """Request cyclic synchronous torque, if 0x6060 can be written; end a halt under which the drive refuses it.
 
-    0x6061 may show the mode later, once the drive is enabled: the cycle compares it. But if no frame carries it, 0x6061
-    must show it within `patience.mode_s`. Return a remark if the EDS lacks 0x6061 then. A drive without 0x6060 and
-    0x6061 has one mode. Raises DeviceError if 0x6061 doesn't show the mode though it must, or the drive refuses or
-    doesn't answer; BusError if the bus fails.
+    A frame that carries 0x6061 may show the mode later, once the drive is enabled: the cycle compares it. If no frame
+    carries it, 0x6061 must show it within `patience.mode_s`. Return a remark if the EDS lacks 0x6061 then. A drive
+    without 0x6060 and 0x6061 has one mode. Raises DeviceError if 0x6061 doesn't show the mode though it must, or the
+    drive refuses or doesn't answer; BusError if the bus fails.
     """
     if slave.can_write(0x6060):
         try:
@@ -305,20 +303,15 @@ def _enter_mode(slave: Slave, codec: Codec) -> list[str]:
             slave.write_object(0x6040, 0, 0)  # some drives refuse another mode under halt
             slave.known.pop((0x6040, 0))
             slave.write_object(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
-    is_shown = shows_mode(codec, slave.name)
-    if not slave.has(0x6061):
-        if is_shown or not slave.can_write(0x6060):
-            return []
-        return ["nothing shows its mode: no frame has `mode_display`, and its EDS lacks 0x6061"]
-    for _ in range(_MODE_READS):
-        if slave.read(0x6061) == MODE_CYCLIC_SYNCHRONOUS_TORQUE:
-            return []
-    if is_shown:
+    if shows_mode(codec, slave.name):
         return []
+    if not slave.has(0x6061):
+        remark = "nothing shows its mode: no frame has `mode_display`, and its EDS lacks 0x6061"
+        return [remark] if slave.can_write(0x6060) else []
     for _ in range(round(slave.device.settings.patience.mode_s / _MODE_POLL_S)):
-        slave.wait(_MODE_POLL_S)
         if slave.read(0x6061) == MODE_CYCLIC_SYNCHRONOUS_TORQUE:
             return []
+        slave.wait(_MODE_POLL_S)
     slave.expect(
         0x6061,
         0,
