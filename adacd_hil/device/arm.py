@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from adacd_hil.device.answer_clock import KEPT, AnswerClock, newest_sample
-from adacd_hil.device.drive import Drive, option_codes, torque_limit_permille
+from adacd_hil.device.drive import Drive
 from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.device.strangers import Strangers
 from adacd_hil.device.torque_sensor import TorqueSensor
@@ -39,13 +39,10 @@ class Arm:
 
     def __init__(self, settings: Settings, codec: Codec, devices: Sequence[PlacedDevice], bus: Bus) -> None:
         """`devices`: Drive1, Drive2, Sensor1, Sensor2. Raises CodecError when the contract lacks a frame or signal."""
-        period_s = settings.bus.period_s
-        self.drives = tuple(_make_drive(settings, codec, device) for device in devices[:JOINTS])
-        self.sensors = tuple(_make_sensor(codec, device, period_s) for device in devices[JOINTS:])
+        self.drives = tuple(Drive(settings, codec, device) for device in devices[:JOINTS])
+        self.sensors = tuple(TorqueSensor(settings, codec, device) for device in devices[JOINTS:])
         self.devices: tuple[Drive | TorqueSensor, ...] = (*self.drives, *self.sensors)
         self._judged: tuple[Drive | TorqueSensor, ...] = (*self.sensors, *self.drives)  # in the order of their faults
-        for device, placed in zip(self.devices, devices, strict=True):
-            device.set_bounds(placed)
         self._bus = bus
         self.sync_id = codec.message("Sync").can_id
         self._is_following = settings.bus.follows
@@ -361,20 +358,3 @@ class Arm:
             tuple(tuple(device.end_to_end.counts) for device in self.devices),
             tuple(device.implausible_frames for device in self.devices),
         )
-
-
-def _make_drive(settings: Settings, codec: Codec, device: PlacedDevice) -> Drive:
-    quick_stop_option, _ = option_codes(settings, device.settings)
-    return Drive(
-        codec,
-        device.joint + 1,
-        settings.bus.period_s,
-        quick_stop_option,
-        torque_limit_permille(settings, device.joint),
-        device.settings.plausibility.position_jump_rad,
-    )
-
-
-def _make_sensor(codec: Codec, device: PlacedDevice, period_s: float) -> TorqueSensor:
-    bounds = device.settings.plausibility
-    return TorqueSensor(codec, device.joint + 1, period_s, bounds.torque_rate_Nm_s, bounds.torque_range_Nm)
