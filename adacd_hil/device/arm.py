@@ -240,19 +240,13 @@ class Arm:
             self._emergencies[device.name] = code
 
     @property
-    def is_complete(self) -> bool:
-        """Whether all cyclic frames of this cycle are in and passed their checks."""
-        return self.received == _COMPLETE
-
-    @property
     def missing_frames(self) -> int:
         """Number of cyclic frames of this cycle that are not in or failed their checks."""
         return (_COMPLETE & ~self.received).bit_count()
 
     def missing_names(self) -> list[str]:
         """Return the names of the devices whose cyclic frame of this cycle is not in or failed its checks."""
-        names = [drive.name for drive in self.drives] + [sensor.name for sensor in self.sensors]
-        return [name for bit, name in enumerate(names) if not self.received & (1 << bit)]
+        return [device.name for bit, device in enumerate(self.devices) if not self.received & (1 << bit)]
 
     def state(self) -> ArmState:
         """Return the state of this cycle. Call it once per cycle, since it stores that the sample is used.
