@@ -185,7 +185,7 @@ class Cycle:
             command, flags = self._limit(arm, output, self._exchange.leave())
             record = self._exchange.end(tick, arm, command, recorder.waiting_bytes)
             self._data.count_cycle(arm)
-            self._faults.count_cycle(self._state, arm)
+            self._faults.commission.count_cycle(self._state, arm)
             self._first_motion.add_cycle(arm, self._state, self._tau_c)
             self._look_after_devices(arm, output)
             self._log(recorder, record, arm, request, output, command, flags)

@@ -176,13 +176,6 @@ class FaultReport:
             FaultReason.ADAPT_TIMEOUT: (pipeline.describe_missing,),
         }
 
-    def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
-        """Count the reasons for which an arm in INIT or COMMISSION stays there in this cycle; else do nothing.
-
-        Events go to `commission`. state: of the scheme after the cycle before.
-        """
-        self.commission.count_cycle(state, arm)
-
     def list_causes(self, fault: FaultReason) -> list[str]:
         """Return the causes of a fault as lines: first those of its reason, then those of host, devices and bus."""
         return [
