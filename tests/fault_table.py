@@ -109,7 +109,7 @@ FRAMES = [
     Case(
         "a drive's status is lost",
         'kind = "lose", node = "drive1", frame = "status"',
-        too_old("Drive1: statusword 251 cycles old, 250 allowed", 251, 150),
+        too_old("Drive1: status 251 cycles old, 250 allowed", 251, 150),
         wire=(Wire(0x281, 140, 0),),
     ),
     Case(

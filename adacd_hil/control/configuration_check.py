@@ -30,8 +30,6 @@ from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.codec import Codec, CodecError
 from adacd_hil.wire.contract_attributes import DEFAULT_BITRATE, read_bitrates
 
-Pair = tuple[float, float]
-
 _ARMS_OWN = ("arm.cad_theta", "controller.Kp", "controller.Kd")
 """Keys that the built-in profiles set for an emulated arm."""
 _MOST_RAD = 2.0 * math.pi

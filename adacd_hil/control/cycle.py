@@ -185,7 +185,7 @@ class Cycle:
             command, flags = self._limit(arm, output, self._exchange.leave())
             record = self._exchange.end(tick, arm, command, recorder.waiting_bytes)
             self._data.count_cycle(arm)
-            self._faults.count_cycle(self._state, arm)
+            self._faults.commission.count_cycle(self._state, arm)
             self._first_motion.add_cycle(arm, self._state, self._tau_c)
             self._look_after_devices(arm, output)
             self._log(recorder, record, arm, request, output, command, flags)
@@ -376,14 +376,15 @@ class Cycle:
     def _disable(self, recorder: Recorder, quick_stop: bool) -> None:
         """Send zero torque and the command to disable the drives for DISABLE_CYCLES cycles, without the scheme.
 
-        quick_stop: the command is a quick stop instead of Disable voltage. Log their frames, and the counts of the
-        frame checks.
+        quick_stop: the command is a quick stop instead of Disable voltage. The host's heartbeat goes on. Log the
+        frames, and the counts of the frame checks.
         """
         self._tau_c[:] = 0.0
         command = ArmCommand(self._tau_c, enable=False, quick_stop=quick_stop)
         for _ in range(DISABLE_CYCLES):
-            tick, _ = self._exchange.turn()
-            self._arm.send_command(command)
+            tick, arm = self._exchange.turn()
+            self._exchange.leave()
+            self._exchange.end(tick, arm, command)
             recorder.cycle(tick.t_ns, [], self._bus.take_passed())
         checks = pack_frame_checks(self._arm.frame_checks())
         recorder.cycle(tick.t_ns, [(ChannelId.FRAME_CHECKS, checks)], self._bus.take_passed())

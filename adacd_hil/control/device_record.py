@@ -1,9 +1,27 @@
-"""A device of the arm in a file that outlives the run, such as a tare or a history."""
+"""Files that outlive the run, such as a tare or a history: how they are read, and a device of the arm in them."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from adacd_hil.device.network import Identity
-from adacd_hil.settings.schema import setting
+from adacd_hil.file_access import read_input
+from adacd_hil.settings.parsing import Section, parse
+from adacd_hil.settings.schema import ConfigError, setting
+from adacd_hil.settings.toml_files import parse_toml
+
+
+def read_record(path: Path, record: type[Section], kind: str, maker: str) -> tuple[bytes, Section]:
+    """Return the text of a file, and the record in it. kind: of the file, maker: its command, in errors.
+
+    Raises ConfigError if it is missing, can't be read, is no TOML, or has an invalid key or value.
+    """
+    if not path.exists():
+        raise ConfigError(f"{kind} {path} does not exist; `adacd-hil {maker}` makes one")
+    try:
+        text = read_input(path)
+        return text, parse(record, parse_toml(text))
+    except (OSError, ConfigError) as error:
+        raise ConfigError(f"{kind} {path}: {getattr(error, 'strerror', error)}") from None
 
 
 @dataclass(frozen=True)

@@ -117,10 +117,10 @@ class SelfChecks:
         """Return a line for the first drive whose torque was outside its recent commands' range for too long, else "".
 
         Outside: by more than `arm.torque_error_share` of its rated torque. Too long: TORQUE_STATUSES in a row, and
-        TORQUE_S. Only statuses of this cycle are judged, and only of drives that report their torque.
+        TORQUE_S. Only a torque of this cycle is judged.
         """
         for drive, rated_Nm in zip(self._arm.drives, self._arm.limits.rated_torque_Nm, strict=True):
-            if drive.status_cycle != cycle or not drive.shows_torque:
+            if drive.torque_cycle != cycle:
                 continue
             excess = self._excess(drive)
             if excess <= 1000.0 * self._torque_share:
@@ -175,13 +175,6 @@ class FaultReport:
             FaultReason.ENABLE_TIMEOUT: (lambda: describe_disabled(arm),),
             FaultReason.ADAPT_TIMEOUT: (pipeline.describe_missing,),
         }
-
-    def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
-        """Count the reasons for which an arm in INIT or COMMISSION stays there in this cycle; else do nothing.
-
-        Events go to `commission`. state: of the scheme after the cycle before.
-        """
-        self.commission.count_cycle(state, arm)
 
     def list_causes(self, fault: FaultReason) -> list[str]:
         """Return the causes of a fault as lines: first those of its reason, then those of host, devices and bus."""

@@ -14,21 +14,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from adacd_hil.control.device_record import DeviceRecord
+from adacd_hil.control.device_record import DeviceRecord, read_record
 from adacd_hil.dates import MOST_AHEAD_H, NS_PER_H, date_ns
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
-from adacd_hil.file_access import read_input
 from adacd_hil.file_replacement import dangling_link, replacing
 from adacd_hil.log.log_files import HISTORY_NAME
 from adacd_hil.printable import number_of
 from adacd_hil.records import Event
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import HISTORY_LARGEST, HistorySettings
 from adacd_hil.settings.schema import ConfigError, setting
-from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.settings.toml_text import to_toml
 
 HISTORY_FORMAT = 1
@@ -147,18 +144,11 @@ def _difference(devices: Sequence[DeviceRecord], identities: Sequence[Identity],
 
 def read_history(path: Path) -> History:
     """Return the history of a file. Raises ConfigError if it is missing, can't be read, is invalid or was changed."""
-    if not path.exists():
-        raise ConfigError(f"history {path} does not exist; `adacd-hil run --history` makes one")
     return _read(path)[1]
 
 
 def _read(path: Path) -> tuple[bytes, History]:
-    """Return the text of a file, and the history in it. Raises ConfigError as `read_history`."""
-    try:
-        text = read_input(path)
-        return text, parse(History, parse_toml(text))
-    except (OSError, ConfigError) as error:
-        raise ConfigError(f"history {path}: {getattr(error, 'strerror', error)}") from error
+    return read_record(path, History, "history", "run --history")
 
 
 @dataclass(frozen=True)

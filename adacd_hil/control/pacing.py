@@ -38,15 +38,11 @@ class HostLatency:
     def __init__(self, settings: LockstepSettings, period_s: float) -> None:
         self._settings = settings
         self._stall_share = period_s / settings.stall_every_s if settings.stall_every_s > 0.0 else 0.0
-        self._constant_ns = round(settings.latency_us * 1000)
-        self._is_constant = settings.latency == "constant" and self._stall_share == 0.0
         self._generator = np.random.default_rng(settings.seed)
         self._drawn: list[int] = []
 
     def draw_ns(self) -> int:
         """Return the latency of the next cycle, ns."""
-        if self._is_constant:
-            return self._constant_ns
         if not self._drawn:
             self._drawn = self._draw_block()
         return self._drawn.pop()

@@ -104,12 +104,8 @@ class Reference(EventSource):
         """Joints that brake beyond their position limit in this state; reported once."""
 
     def compile_motion(self) -> None:
-        """Evaluate trajectory, excitation if there is one, and a withdrawal once, so that they don't compile later."""
-        zeros, scratch = np.zeros(JOINTS), np.zeros((3, JOINTS))
-        self._follow(0.0, *scratch)
-        if self._excitation.is_on:
-            self._excitation.evaluate(0.0, *scratch)
-        Withdrawal(self._settings, zeros, zeros, np.ones(JOINTS)).evaluate(0.0, *scratch)
+        """Evaluate the trajectory once, so that it doesn't compile later; no other motion is compiled."""
+        self._follow(0.0, *np.zeros((3, JOINTS)))
 
     @property
     def is_floating(self) -> bool:

@@ -230,7 +230,6 @@ class Session:
         instead of raising it. At the end log the counts of the frame checks, and each certificate.
         """
         arm, master, cycle = attempt
-        ending = Ending(None, "", is_bus_failed=False)
         try:
             self.progress(f"looking for the arm on {tap.channel}")
             if not self.is_lockstep:

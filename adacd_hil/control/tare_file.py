@@ -11,19 +11,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from adacd_hil.control.device_record import DeviceRecord
+from adacd_hil.control.device_record import DeviceRecord, read_record
 from adacd_hil.dates import MOST_AHEAD_H, NS_PER_H, date_ns
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
-from adacd_hil.file_access import read_input
 from adacd_hil.file_replacement import replacing
 from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.records import JOINTS, Event
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import TareSettings
 from adacd_hil.settings.schema import ConfigError, setting
-from adacd_hil.settings.toml_files import read_toml
 from adacd_hil.settings.toml_text import to_toml
 
 TARE_FORMAT = 1
@@ -109,14 +106,12 @@ class Tare:
 
 
 def read_tare(path: Path) -> Tare:
-    """Return the tare of a file. Raises ConfigError if it can't be read, is no TOML, or has an invalid key or value."""
-    if not path.exists():
-        raise ConfigError(f"tare {path} does not exist; `adacd-hil tare` makes one")
-    table = read_toml(path, "tare")
-    try:
-        return parse(Tare, table)
-    except ConfigError as error:
-        raise ConfigError(f"tare {path}: {error}") from None
+    """Return the tare of a file. Raises ConfigError as `read_record`."""
+    return _read(path)[1]
+
+
+def _read(path: Path) -> tuple[bytes, Tare]:
+    return read_record(path, Tare, "tare", "tare")
 
 
 def write_tare(tare: Tare, path: Path) -> Path | None:
@@ -207,7 +202,7 @@ def use_tare(path: Path, settings: Settings, now_ns: int) -> UsedTare:
     it was measured with another sign, without gravity where the configuration has it or the other way round, or in
     gravity with another mounting or zero.
     """
-    tare = read_tare(path)
+    text, tare = _read(path)
     if tare.sign != settings.arm.sign:
         raise ConfigError(
             f"tare {path} was measured with arm.sign = {list(tare.sign)}, but the configuration has "
@@ -240,4 +235,4 @@ def use_tare(path: Path, settings: Settings, now_ns: int) -> UsedTare:
         warnings.append(f"{path} is dated {-age_h:.1f} h in the future: a clock is wrong")
     if tare.is_auto_zeroed:
         warnings.append(f"{path} counts on the zero that the sensors set themselves; a sensor that was reset forgot it")
-    return UsedTare(path, read_input(path), tare, max(age_h, 0.0) * 3600.0, tuple(warnings))
+    return UsedTare(path, text, tare, max(age_h, 0.0) * 3600.0, tuple(warnings))

@@ -3,13 +3,14 @@
 Sign, zeros and torque ratio are applied here. Every value carries its age in cycles.
 """
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 
 from adacd_hil.device.answer_clock import KEPT, AnswerClock, newest_sample
-from adacd_hil.device.drive import Drive, option_codes, torque_limit_permille
+from adacd_hil.device.drive import Drive
 from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.device.strangers import Strangers
 from adacd_hil.device.torque_sensor import TorqueSensor
@@ -30,8 +31,7 @@ _Command = tuple[list[float], bool, bool]
 """Commanded torque of each joint, Nm; whether the drives are to be enabled; whether they are to stop quickly."""
 _COMPLETE = 0xF  # one bit per cyclic frame: feedback 1, 2, torque 1, 2
 _EMERGENCY_BYTES = 8
-REMEMBERED_GAPS = 0xFF
-"""Mask of a device's bits in `Arm.gaps`: one for each of the last eight cycles."""
+_REMEMBERED_CYCLES = 8
 
 
 class Arm:
@@ -39,13 +39,10 @@ class Arm:
 
     def __init__(self, settings: Settings, codec: Codec, devices: Sequence[PlacedDevice], bus: Bus) -> None:
         """`devices`: Drive1, Drive2, Sensor1, Sensor2. Raises CodecError when the contract lacks a frame or signal."""
-        period_s = settings.bus.period_s
-        self.drives = tuple(_make_drive(settings, codec, device) for device in devices[:JOINTS])
-        self.sensors = tuple(_make_sensor(codec, device, period_s) for device in devices[JOINTS:])
+        self.drives = tuple(Drive(settings, codec, device) for device in devices[:JOINTS])
+        self.sensors = tuple(TorqueSensor(settings, codec, device) for device in devices[JOINTS:])
         self.devices: tuple[Drive | TorqueSensor, ...] = (*self.drives, *self.sensors)
         self._judged: tuple[Drive | TorqueSensor, ...] = (*self.sensors, *self.drives)  # in the order of their faults
-        for device, placed in zip(self.devices, devices, strict=True):
-            device.set_bounds(placed)
         self._bus = bus
         self.sync_id = codec.message("Sync").can_id
         self._is_following = settings.bus.follows
@@ -72,14 +69,14 @@ class Arm:
         self._periods = 1
         self.received = 0
         """Bits of the devices whose cyclic frame of this cycle is in and passed its checks."""
+        self.received_before = deque([_COMPLETE] * _REMEMBERED_CYCLES, maxlen=_REMEMBERED_CYCLES)
+        """`received` of the last cycles, the present one excepted."""
         self._seen = 0
         self.was_enabled = False
         self._ordinal = -1  # of the last SYNC
         self._sync_cycles, self._sync_ns = [-1] * KEPT, [0] * KEPT  # of the last SYNCs, by ordinal
         self._clocks = tuple(AnswerClock() for _ in self.devices)
         self._sampled_ordinal = self._sampled_cycle = -1  # of the last complete sample
-        self.gaps = [0] * len(self.devices)  # bit k: no usable frame k + 1 cycles before the present one
-        self._has_gaps = False
         self._last_data = [b""] * len(self.devices)
         self.repeats = [0] * len(self.devices)
         """How often each device's frame came again, the same or with the same counter."""
@@ -98,15 +95,14 @@ class Arm:
     def synchronise(self, cycle: int, t_ns: int, periods: int) -> None:
         """Begin a cycle: send SYNC, unless another host sends it, then the pipelined commands of `send_command`.
 
-        First, count a miss of each device whose frame the ending cycle lacks, and shift `gaps`. Pipelined commands are
-        sent without torque if `periods` exceeds `bus.max_age_cycles`. `cycle`, `t_ns`: number and host time of this
-        SYNC. `periods`: since the previous SYNC. Raises BusError if the bus refuses a frame.
+        First, count a miss of each device whose frame the ending cycle lacks, and extend `received_before`. Pipelined
+        commands are sent without torque if `periods` exceeds `bus.max_age_cycles`. `cycle`, `t_ns`: number and host
+        time of this SYNC. `periods`: since the previous SYNC. Raises BusError if the bus refuses a frame.
         """
         if self._cycle >= 0:
             if not self.has_all_frames:
                 self._miss()
-            if self.received != _COMPLETE or self._has_gaps:
-                self._remember_gaps()
+            self.received_before.append(self.received)
         self._cycle = cycle
         self._t_ns = t_ns
         self._ordinal += 1
@@ -134,12 +130,6 @@ class Arm:
         for bit, device in enumerate(self.devices):
             if not self._seen & (1 << bit):
                 device.miss()
-
-    def _remember_gaps(self) -> None:
-        """Shift each device's bits in `gaps` by one; set bit 0 if the ending cycle had no usable frame of it."""
-        for place, gaps in enumerate(self.gaps):
-            self.gaps[place] = (gaps << 1 | ~self.received >> place & 1) & REMEMBERED_GAPS
-        self._has_gaps = any(self.gaps)
 
     def accept(self, frame: Frame, is_late: bool = False) -> bool:
         """Take a frame; return True for a cyclic or status frame of the arm, and for one that only this host may send.
@@ -250,19 +240,13 @@ class Arm:
             self._emergencies[device.name] = code
 
     @property
-    def is_complete(self) -> bool:
-        """Whether all cyclic frames of this cycle are in and passed their checks."""
-        return self.received == _COMPLETE
-
-    @property
     def missing_frames(self) -> int:
         """Number of cyclic frames of this cycle that are not in or failed their checks."""
         return (_COMPLETE & ~self.received).bit_count()
 
     def missing_names(self) -> list[str]:
         """Return the names of the devices whose cyclic frame of this cycle is not in or failed its checks."""
-        names = [drive.name for drive in self.drives] + [sensor.name for sensor in self.sensors]
-        return [name for bit, name in enumerate(names) if not self.received & (1 << bit)]
+        return [device.name for bit, device in enumerate(self.devices) if not self.received & (1 << bit)]
 
     def state(self) -> ArmState:
         """Return the state of this cycle. Call it once per cycle, since it stores that the sample is used.
@@ -361,20 +345,3 @@ class Arm:
             tuple(tuple(device.end_to_end.counts) for device in self.devices),
             tuple(device.implausible_frames for device in self.devices),
         )
-
-
-def _make_drive(settings: Settings, codec: Codec, device: PlacedDevice) -> Drive:
-    quick_stop_option, _ = option_codes(settings, device.settings)
-    return Drive(
-        codec,
-        device.joint + 1,
-        settings.bus.period_s,
-        quick_stop_option,
-        torque_limit_permille(settings, device.joint),
-        device.settings.plausibility.position_jump_rad,
-    )
-
-
-def _make_sensor(codec: Codec, device: PlacedDevice, period_s: float) -> TorqueSensor:
-    bounds = device.settings.plausibility
-    return TorqueSensor(codec, device.joint + 1, period_s, bounds.torque_rate_Nm_s, bounds.torque_range_Nm)

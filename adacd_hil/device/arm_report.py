@@ -11,7 +11,7 @@ Cycles are counted only while the drives are enabled: data from before and after
 import math
 from dataclasses import dataclass
 
-from adacd_hil.device.arm import REMEMBERED_GAPS, Arm
+from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_watch import EventSource
 from adacd_hil.device.canopen_bus import name_error
 from adacd_hil.device.drive import Cia402State, Drive
@@ -160,15 +160,14 @@ class DataWatch(EventSource):
 def describe_gaps(arm: Arm) -> list[str]:
     """Return a line per device with gaps: in how many of the last cycles it had no usable frame in time.
 
-    Count the present cycle and those in `REMEMBERED_GAPS`; skip devices without a gap.
+    Count the present cycle, too; skip devices without a gap.
     """
-    present = [~arm.received >> place & 1 for place in range(len(arm.devices))]
-    gaps = [bits << 1 | now for bits, now in zip(arm.gaps, present, strict=True)]
-    cycles = REMEMBERED_GAPS.bit_length() + 1
+    received = [*arm.received_before, arm.received]
+    gaps = [sum(~bits >> place & 1 for bits in received) for place in range(len(arm.devices))]
     return [
-        f"{device.name}: no usable frame in time in {bits.bit_count()} of the last {cycles} cycles"
-        for device, bits in zip(arm.devices, gaps, strict=True)
-        if bits
+        f"{device.name}: no usable frame in time in {count} of the last {len(received)} cycles"
+        for device, count in zip(arm.devices, gaps, strict=True)
+        if count
     ]
 
 
@@ -212,7 +211,7 @@ def describe_faults(arm: Arm) -> list[str]:
     for drive in arm.drives:
         ages.append((f"{drive.name}: position, velocity", drive.sample_cycle, arm.max_age_cycles))
         if drive.has_status_frame:
-            ages.append((f"{drive.name}: statusword", drive.status_cycle, drive.status_age_limit))
+            ages.append((f"{drive.name}: status", drive.status_cycle, drive.status_age_limit))
     ages += ((f"{sensor.name}: torque", sensor.sample_cycle, arm.max_age_cycles) for sensor in arm.sensors)
     lines += (
         f"{signals} {arm.cycle - cycle} cycles old, {limit:g} allowed"

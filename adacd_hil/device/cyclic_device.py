@@ -8,7 +8,8 @@ from adacd_hil.device.arm_watch import PATIENCE_PERIODS
 from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.device.value_bounds import ValueBound, value_bounds
 from adacd_hil.records import FaultReason
-from adacd_hil.wire.codec import Codec, MessageCodec
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.wire.codec import Codec
 
 
 class CyclicDevice(ABC):
@@ -18,50 +19,42 @@ class CyclicDevice(ABC):
     those in use, the main one first. sample_cycle: cycle of the values in use; -1 before the first.
     """
 
-    def __init__(self, codec: Codec, name: str, message: MessageCodec, main: str, period_s: float) -> None:
-        """`message`: the cyclic frame. `main`: its signal that is checked for plausibility without end-to-end header.
+    def __init__(self, settings: Settings, codec: Codec, placed: PlacedDevice, cyclic: str, main: str) -> None:
+        """`cyclic`: the cyclic frame. `main`: its signal that is checked for plausibility without end-to-end header.
 
-        Raises CodecError when `message` lacks that signal.
+        The status may be PATIENCE_PERIODS periods old, rounded up to whole cycles; any age without a period. Raises
+        CodecError when the contract lacks the cyclic frame, or a frame lacks `main` or a bounded signal.
         """
-        self.name = name
+        self.name = placed.name
+        self._message = message = codec.message(f"{placed.name}{cyclic}")
         self.node_id = codec.node_id(message.name)
-        self._message = message
         self.can_id = message.can_id  # of its cyclic frame
         self.cyclic_length = message.length
         """Bytes of its cyclic frame."""
         self.is_protected = message.is_protected
         self.end_to_end = message.receiver()
-        self.status_message = codec.messages.get(f"{name}Status")
+        self.status_message = codec.messages.get(f"{placed.name}Status")
         self._status_receiver = None if self.status_message is None else self.status_message.receiver()
         self.values: tuple[float, ...] = ()
         self.sample_cycle = -1
         self.implausible_frames = 0
-        self._period_s = period_s
+        self._period_s = settings.bus.period_s
         self._main_at = message.place(main)
         self._received: float | None = None  # main value of the last frame that came
         self._received_cycle = 0
+        status = placed.pdo("Status")
         self.status_age_limit = math.inf
         """Greatest permitted age of its status, in cycles; infinite without a status period."""
-        self.has_bounds = False
-        """Whether its profile bounds a value."""
-        self._cyclic_bounds: tuple[ValueBound, ...] = ()
-        self._status_bounds: tuple[ValueBound, ...] = ()
-        self._cyclic_values: Sequence[float] = ()
-        self._status_values: Sequence[float] = ()
-        self._status_came: float = -math.inf  # cycle of the last status frame
-
-    def set_bounds(self, placed: PlacedDevice) -> None:
-        """Take over the bounds of values and the period of the status from the device's profile.
-
-        The status may be PATIENCE_PERIODS periods old, rounded up to whole cycles; any age without a period. Raises
-        CodecError when a frame lacks a bounded signal.
-        """
-        status, cyclic = placed.pdo("Status"), self._message.name.removeprefix(self.name)
         if status is not None and status.event_timer_ms:
             self.status_age_limit = math.ceil(PATIENCE_PERIODS * status.event_timer_ms * 1e-3 / self._period_s)
-        self._cyclic_bounds = value_bounds(placed.pdo(cyclic), self._message)
+        self._cyclic_bounds = value_bounds(placed.pdo(cyclic), message)
         self._status_bounds = value_bounds(status, self.status_message)
         self.has_bounds = bool(self._cyclic_bounds or self._status_bounds)
+        """Whether its profile bounds a value."""
+        self._cyclic_values: Sequence[float] = ()
+        self._status_values: Sequence[float] = ()
+        self.status_cycle = -1
+        """Cycle of the last status frame; -1 before the first."""
 
     def accept_cyclic(self, data: bytes, cycle: int) -> bool:
         """Take one cyclic frame of `cycle`; return False for a wrong length or header, or no plausible main value.
@@ -98,7 +91,7 @@ class CyclicDevice(ABC):
             return False
         is_valid = receiver.check(data).is_valid
         if is_valid:
-            self._status_values, self._status_came = message.decode_values(data), cycle
+            self._status_values, self.status_cycle = message.decode_values(data), cycle
             self._use_status(self._status_values, cycle)
         return is_valid
 
@@ -122,7 +115,8 @@ class CyclicDevice(ABC):
         return [f"{self.name}: {bound.describe(values)}" for bound, values in self._excesses()]
 
     def _is_status_old(self, cycle: int) -> bool:
-        return bool(self._status_bounds) and cycle - self._status_came > self.status_age_limit
+        is_old = not self._status_values or cycle - self.status_cycle > self.status_age_limit
+        return bool(self._status_bounds) and is_old
 
     def _excesses(self) -> Iterator[tuple[ValueBound, Sequence[float]]]:
         """Yield (bound, values of its frame) for each bounded value outside its bounds in the newest valid frame."""

@@ -9,6 +9,7 @@ valid last. PDOs that the contract doesn't know are switched off: a stock device
 """
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, NoReturn
 
@@ -140,8 +141,6 @@ def _number(value: int) -> str:
 
 
 CST_SUPPORTED = 1 << 9  # of 0x6502
-_MODE_READS = 20
-"""A drive may take a few of its own cycles to show a new mode; an SDO takes 0.3 ms at 1 Mbit/s at the least."""
 
 
 def command_deadline_ms(settings: Settings) -> int:
@@ -291,10 +290,10 @@ _MODE_POLL_S = 0.02
 def _enter_mode(slave: Slave, codec: Codec) -> list[str]:
     """Request cyclic synchronous torque, if 0x6060 can be written; end a halt under which the drive refuses it.
 
-    0x6061 may show the mode later, once the drive is enabled: the cycle compares it. But if no frame carries it, 0x6061
-    must show it within `patience.mode_s`. Return a remark if the EDS lacks 0x6061 then. A drive without 0x6060 and
-    0x6061 has one mode. Raises DeviceError if 0x6061 doesn't show the mode though it must, or the drive refuses or
-    doesn't answer; BusError if the bus fails.
+    A frame that carries 0x6061 may show the mode later, once the drive is enabled: the cycle compares it. If no frame
+    carries it, 0x6061 must show it within `patience.mode_s`. Return a remark if the EDS lacks 0x6061 then. A drive
+    without 0x6060 and 0x6061 has one mode. Raises DeviceError if 0x6061 doesn't show the mode though it must, or the
+    drive refuses or doesn't answer; BusError if the bus fails.
     """
     if slave.can_write(0x6060):
         try:
@@ -305,20 +304,15 @@ def _enter_mode(slave: Slave, codec: Codec) -> list[str]:
             slave.write_object(0x6040, 0, 0)  # some drives refuse another mode under halt
             slave.known.pop((0x6040, 0))
             slave.write_object(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
-    is_shown = shows_mode(codec, slave.name)
-    if not slave.has(0x6061):
-        if is_shown or not slave.can_write(0x6060):
-            return []
-        return ["nothing shows its mode: no frame has `mode_display`, and its EDS lacks 0x6061"]
-    for _ in range(_MODE_READS):
-        if slave.read(0x6061) == MODE_CYCLIC_SYNCHRONOUS_TORQUE:
-            return []
-    if is_shown:
+    if shows_mode(codec, slave.name):
         return []
+    if not slave.has(0x6061):
+        remark = "nothing shows its mode: no frame has `mode_display`, and its EDS lacks 0x6061"
+        return [remark] if slave.can_write(0x6060) else []
     for _ in range(round(slave.device.settings.patience.mode_s / _MODE_POLL_S)):
-        slave.wait(_MODE_POLL_S)
         if slave.read(0x6061) == MODE_CYCLIC_SYNCHRONOUS_TORQUE:
             return []
+        slave.wait(_MODE_POLL_S)
     slave.expect(
         0x6061,
         0,
@@ -397,8 +391,8 @@ class ParameterWatch(RateLimitedEvents):
     def __init__(self, settings: Settings, bus: Bus) -> None:
         super().__init__()
         self._bus = bus
-        self._objects: tuple[_KnownObject, ...] = ()
-        self._next = 0
+        self._objects: deque[_KnownObject] = deque()
+        """Those that are read, the next one first."""
         self._asked: _KnownObject | None = None
         self._asked_cycle = 0
         self._pause_cycles: dict[int, int] = {}
@@ -418,7 +412,7 @@ class ParameterWatch(RateLimitedEvents):
         found = [[_KnownObject(slave, place, value) for place, value in slave.known.items()] for slave in slaves]
         # By turns, so that no device waits for all objects of another.
         longest = max(map(len, found), default=0)
-        self._objects = tuple(objects[k] for k in range(longest) for objects in found if k < len(objects))
+        self._objects = deque(objects[k] for k in range(longest) for objects in found if k < len(objects))
         self._pause_cycles = {
             one.slave.node_id: math.ceil(one.slave.device.settings.patience.pause_ms * 1e-3 / self._period_s)
             for one in self._objects
@@ -437,14 +431,14 @@ class ParameterWatch(RateLimitedEvents):
             self._asked = asked = None
         if asked is not None or not (self._reread_ms and self._objects):
             return
-        chosen = self._objects[self._next]
+        chosen = self._objects[0]
         node_id = chosen.slave.node_id
         is_paused = cycle - self._last_cycle.get(node_id, -math.inf) <= self._pause_cycles[node_id]
         if is_paused or not self._due.take_turn(cycle):
             return
         self._asked = chosen
         self._asked_cycle = self._last_cycle[node_id] = cycle
-        self._next = (self._next + 1) % len(self._objects)
+        self._objects.rotate(-1)
         index, sub = chosen.place
         request = bytes((_UPLOAD, index & 0xFF, index >> 8, sub, 0, 0, 0, 0))
         self._bus.send(SDO_REQUEST_ID + chosen.slave.node_id, request)
@@ -465,8 +459,7 @@ class ParameterWatch(RateLimitedEvents):
             code = int.from_bytes(data[4:], "little")
             text = f"{asked.name} can't be read again: 0x{code:08X}"
             self.report(frame.t_ns, asked.name, Event("warning", "parameters", text))
-            self._objects = tuple(one for one in self._objects if one is not asked)
-            self._next = self._next % max(len(self._objects), 1)
+            self._objects.remove(asked)
         elif data[0] & 0xE2 == 0x42:  # expedited, with or without its size
             size = 4 - (data[0] >> 2 & 3) if data[0] & 1 else 4
             self._compare(asked, int.from_bytes(data[4 : 4 + size], "little"), size)

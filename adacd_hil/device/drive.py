@@ -10,7 +10,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from adacd_hil.device.cyclic_device import CyclicDevice
-from adacd_hil.device.profile import PlausibilitySettings, ProfileSettings
+from adacd_hil.device.profile import PlacedDevice, ProfileSettings
 from adacd_hil.records import FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
@@ -19,10 +19,6 @@ MODE_CYCLIC_SYNCHRONOUS_TORQUE = 10
 
 DISABLE_CYCLES = 20
 """Cycles of disabling at the end of a run: drives need two, the rest shows in the log that they did."""
-
-IMPLAUSIBLE_JUMP_RAD = PlausibilitySettings().position_jump_rad
-"""Position against velocity, per frame. The drive's velocity lags 1.6 ms, so 100 rad/s² leave 0.16 mrad in 1 ms; a
-flipped high bit of the unprotected frame is at least 0.1 rad."""
 
 
 class Cia402State(IntEnum):
@@ -127,60 +123,48 @@ def decode_statusword(statusword: int) -> Cia402State:
 class Drive(CyclicDevice):
     """One drive of the arm, joint 1 or 2. Its status may be in a frame of its own or in the feedback."""
 
-    def __init__(
-        self,
-        codec: Codec,
-        joint: int,
-        period_s: float,
-        quick_stop_option: int | None = None,
-        max_torque_permille: int = 1000,
-        position_jump_rad: float = IMPLAUSIBLE_JUMP_RAD,
-    ) -> None:
-        """`quick_stop_option`: 0x605A, None when unknown. `max_torque_permille`: for commands that carry 0x6072.
-
-        `position_jump_rad`: largest step of an unprotected position beyond velocity x time that is plausible.
-        Raises CodecError when the contract lacks a message or signal, or a command has one that the host can't fill.
-        """
-        name = f"Drive{joint}"
-        feedback = codec.message(f"{name}Feedback")
-        super().__init__(codec, name, feedback, "position", period_s)
-        self._command_message = codec.message(f"{name}Command")
+    def __init__(self, settings: Settings, codec: Codec, placed: PlacedDevice) -> None:
+        """Raise CodecError when the contract lacks a message or signal, or a command has one that can't be filled."""
+        super().__init__(settings, codec, placed, "Feedback", "position")
+        self._command_message = codec.message(f"{self.name}Command")
         self.command_id = self._command_message.can_id
         self._sender = self._command_message.sender()
-        self._quick_stop_option = quick_stop_option
-        self._position_jump_rad = position_jump_rad
-        self._velocity_at = feedback.place("velocity")
-        self._feedback_status = _status_places(feedback)
+        self._quick_stop_option, _ = option_codes(settings, placed.settings)
+        self._position_jump_rad = placed.settings.plausibility.position_jump_rad
+        self._velocity_at = self._message.place("velocity")
+        self._feedback_status = _status_places(self._message)
         self._status_places = _NO_STATUS if self.status_message is None else _status_places(self.status_message)
         self._command, self._controlword_at, self._torque_at = _command_template(
-            self._command_message, max_torque_permille
+            self._command_message, torque_limit_permille(settings, placed.joint)
         )
-        self.has_status_frame = self._feedback_status == _NO_STATUS
-        """Whether the status comes in a frame of its own."""
+        deciding = zip(self._feedback_status[:2], self._status_places[:2], strict=True)
+        self.has_status_frame = any(own < 0 <= other for own, other in deciding)
+        """Whether statusword or mode, which decide whether the drive is enabled, come in a status frame alone."""
         if max(self._feedback_status.statusword, self._status_places.statusword) < 0:
-            raise CodecError(f"{name}: no message carries signal statusword")
+            raise CodecError(f"{self.name}: no message carries signal statusword")
         self._last_controlword = Controlword.DISABLE_VOLTAGE
         self.recent_permille: deque[int] = deque([0], maxlen=_RECENT_COMMANDS)
         """Commanded torque of the last cycles, per mille of rated torque."""
         self.values = 0.0, 0.0  # position, rad, and velocity, rad/s
-        self.status_cycle = -1
-        """Cycle in which the status in use came; -1 before the first."""
         self.state = Cia402State.NOT_READY_TO_SWITCH_ON
         self.statusword = 0
         # If no frame shows the mode, the master has compared 0x6061 before the start, if `_enter_mode` could.
-        self.mode = 0 if shows_mode(codec, name) else MODE_CYCLIC_SYNCHRONOUS_TORQUE
+        self.mode = 0 if shows_mode(codec, self.name) else MODE_CYCLIC_SYNCHRONOUS_TORQUE
         self.is_enabled = False
         """Whether the drive produces the commanded torque."""
         self.torque_actual_permille = 0
+        self.torque_cycle = -1
+        """Cycle of the last frame with the actual torque; -1 before the first."""
         self.error_code = 0
 
     def fault(self, cycle: int, is_enabled: bool) -> FaultReason:
-        """Return DATA_AGE if the drives are enabled (`is_enabled`) and the status is older than `status_age_limit`.
+        """Return DATA_AGE if the drives are enabled (`is_enabled`) and a needed status frame is too old.
 
-        Else DRIVE if a bounded value is outside its bounds, or a status with such values missing or too old; else NONE.
-        The drive's own FAULT state and `error_code` don't count here.
+        Needed: as of `has_status_frame`; too old: older than `status_age_limit`. Else DRIVE if a bounded value is
+        outside its bounds, or a status with such values missing or too old; else NONE. The drive's own FAULT state and
+        `error_code` don't count here.
         """
-        if is_enabled and cycle - self.status_cycle > self.status_age_limit:
+        if is_enabled and self.has_status_frame and cycle - self.status_cycle > self.status_age_limit:
             return FaultReason.DATA_AGE
         return FaultReason.DRIVE if self.has_excess(cycle) else FaultReason.NONE
 
@@ -191,16 +175,10 @@ class Drive(CyclicDevice):
     def _use(self, data: bytes, values: Sequence[float], cycle: int) -> None:  # noqa: ARG002 (as of all devices)
         self.values = values[self._main_at], values[self._velocity_at]
         self.sample_cycle = cycle
-        if not self.has_status_frame:
-            self._take_status(values, self._feedback_status, cycle)
+        self._take_status(values, self._feedback_status, cycle)
 
     def _use_status(self, values: Sequence[float], cycle: int) -> None:
         self._take_status(values, self._status_places, cycle)
-
-    @property
-    def shows_torque(self) -> bool:
-        """Whether some frame carries the actual torque, 0x6077."""
-        return max(self._feedback_status.torque_actual, self._status_places.torque_actual) >= 0
 
     @property
     def is_limited(self) -> bool:
@@ -224,7 +202,6 @@ class Drive(CyclicDevice):
 
         at: their places among `values`.
         """
-        self.status_cycle = cycle
         if at.statusword >= 0:
             self.statusword = int(values[at.statusword])
             self.state = decode_statusword(self.statusword)
@@ -233,6 +210,7 @@ class Drive(CyclicDevice):
         self.is_enabled = self.state is Cia402State.OPERATION_ENABLED and self.mode == MODE_CYCLIC_SYNCHRONOUS_TORQUE
         if at.torque_actual >= 0:
             self.torque_actual_permille = int(values[at.torque_actual])
+            self.torque_cycle = cycle
         if at.error_code >= 0:
             self.error_code = int(values[at.error_code])
 

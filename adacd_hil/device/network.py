@@ -45,6 +45,46 @@ class Identity(NamedTuple):
     serial: int
 
 
+def identity_difference(slave: Slave, device_type: int, found: Identity) -> tuple[str, str, str]:
+    """Return the first difference of a device found from its EDS and profile: quantity, values, remedy; "" without one.
+
+    If the profile's `identity` is "eds", type, vendor and product must be the EDS's, and the revision one that the EDS
+    covers. Of the type, 0x1000, the low word counts; any value that the EDS leaves open fits. The serial number must be
+    the profile's if that has one. found: 0 for an entry of 0x1018 that was not read.
+    """
+    profile, name = slave.device.settings, slave.device.profile.name
+    if profile.identity == "eds":
+        another = (
+            f"another device has this node id, or profile {name} is of another: `adacd-hil scan` lists the nodes; "
+            f"correct `devices.{profile.kind}_node` or `devices.{profile.kind}`"
+        )
+        expected_type = slave.default(0x1000)
+        if expected_type is not None and (device_type ^ expected_type) & _PROFILE_NUMBER_MASK:
+            return "device type", f"0x1000 = 0x{device_type:08X}, 0x{expected_type:08X} expected", another
+        for quantity, value, expected in (
+            ("vendor", found.vendor, slave.default(0x1018, 1)),
+            ("product code", found.product, slave.default(0x1018, 2)),
+        ):
+            if expected is not None and value != expected:
+                return quantity, f"0x{value:X} is not the EDS's 0x{expected:X}", another
+        # CiA 301, 7.5.2.19: the high word stands for a behaviour on the bus, the low word for versions of it.
+        revision = slave.default(0x1018, 3) or 0
+        major, minor = divmod(revision, 1 << 16)
+        if revision and (found.revision >> 16 != major or found.revision & 0xFFFF < minor):
+            return (
+                "revision",
+                f"0x{found.revision:X} is not of the EDS's 0x{revision:X}",
+                f'get the EDS of this firmware from the maker; `identity = "any"` in {name} takes every revision',
+            )
+    if profile.serial and found.serial != profile.serial[slave.device.joint]:
+        return (
+            "serial number",
+            f"0x1018:4 = {found.serial}, {profile.serial[slave.device.joint]} expected",
+            f"the device was changed, or moved to another joint: correct `serial` of {name}",
+        )
+    return "", "", ""
+
+
 class Master(EventSource):
     """The CANopen master of one arm."""
 
@@ -154,44 +194,14 @@ class Master(EventSource):
                 f'correct `devices.{profile.kind}_node`, or `devices.contract` = "" composes the frames',
             )
         device_type = slave.read(0x1000)
-        read = {sub: slave.read(0x1018, sub) if slave.has(0x1018, sub) else 0 for sub in (1, 2, 3, 4)}
-        if profile.identity == "eds":
-            self._check_identity(slave, device_type, read)
-        if profile.serial and read[4] != profile.serial[slave.device.joint]:
-            slave.fail(
-                f"serial number 0x1018:4 = {read[4]}, {profile.serial[slave.device.joint]} expected",
-                f"the device was changed, or moved to another joint: correct `serial` of {slave.device.profile.name}",
-            )
+        read = (slave.read(0x1018, sub) if slave.has(0x1018, sub) else 0 for sub in (1, 2, 3, 4))
+        found = Identity(slave.name, slave.node_id, *read)
+        quantity, difference, remedy = identity_difference(slave, device_type, found)
+        if difference:
+            slave.fail(f"{quantity} {difference}", remedy)
         if profile.contract_object:
             self.check_contract(slave)
-        return Identity(slave.name, slave.node_id, *read.values())
-
-    @staticmethod
-    def _check_identity(slave: Slave, device_type: int, read: dict[int, int]) -> None:
-        """Raise DeviceError if type, vendor or product isn't the EDS's, or the revision is none that the EDS covers.
-
-        Of the type, 0x1000, the low word counts. Accept any value that the EDS leaves open. read: 0x1018 by sub-index.
-        """
-        kind, name = slave.device.settings.kind, slave.device.profile.name
-        another = (
-            f"another device has this node id, or profile {name} is of another: `adacd-hil scan` lists the nodes; "
-            f"correct `devices.{kind}_node` or `devices.{kind}`"
-        )
-        expected_type = slave.default(0x1000)
-        if expected_type is not None and (device_type ^ expected_type) & _PROFILE_NUMBER_MASK:
-            slave.fail(f"device type 0x1000 = 0x{device_type:08X}, 0x{expected_type:08X} expected", another)
-        for sub, what in ((1, "vendor"), (2, "product code")):
-            expected = slave.default(0x1018, sub)
-            if expected is not None and read[sub] != expected:
-                slave.fail(f"{what} 0x{read[sub]:X} is not the EDS's 0x{expected:X}", another)
-        # CiA 301, 7.5.2.19: the high word stands for a behaviour on the bus, the low word for versions of it.
-        revision = slave.default(0x1018, 3) or 0
-        major, minor = divmod(revision, 1 << 16)
-        if revision and (read[3] >> 16 != major or read[3] & 0xFFFF < minor):
-            slave.fail(
-                f"revision 0x{read[3]:X} is not of the EDS's 0x{revision:X}",
-                f'get the EDS of this firmware from the maker; `identity = "any"` in {name} takes every revision',
-            )
+        return found
 
     def check_contract(self, slave: Slave) -> None:
         """Raise DeviceError unless the device has the DBC's wire version and layout digest in 0x2000.

@@ -5,12 +5,13 @@ one ages. Torque is the device's own, with its own zero: sign and tare belong to
 404, clause 7.
 """
 
-import math
 from collections.abc import Sequence
 from enum import IntFlag
 
 from adacd_hil.device.cyclic_device import CyclicDevice
+from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.records import FaultReason
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
 
 
@@ -31,29 +32,19 @@ USABLE = tuple(status for status in _STATUSES if not status & SensorStatus.NOT_V
 class TorqueSensor(CyclicDevice):
     """The torque sensor of joint 1 or 2."""
 
-    def __init__(
-        self,
-        codec: Codec,
-        joint: int,
-        period_s: float = 0.001,
-        torque_rate_Nm_s: float = math.inf,
-        torque_range_Nm: float = 0.0,
-    ) -> None:
-        """`torque_rate_Nm_s`: the largest plausible rate of torque between unprotected frames. `period_s`: of SYNC.
+    def __init__(self, settings: Settings, codec: Codec, placed: PlacedDevice) -> None:
+        """Raise CodecError when the contract lacks a message or signal."""
+        super().__init__(settings, codec, placed, "Torque", "torque")
+        self._torque_rate_Nm_s = placed.settings.plausibility.torque_rate_Nm_s
+        self.torque_range_Nm = placed.settings.plausibility.torque_range_Nm
+        """Torque in either direction from which the sensor counts as overloaded and not valid; 0: none.
 
-        `torque_range_Nm`: torque in either direction from which a sensor counts as overloaded and not valid, if its
-        torque frame carries no status; 0: none.
-
-        Raises CodecError when the contract lacks a message or signal.
+        Only if its torque frame carries no status.
         """
-        name = f"Sensor{joint}"
-        message = codec.message(f"{name}Torque")
-        super().__init__(codec, name, message, "torque", period_s)
-        self._torque_rate_Nm_s = torque_rate_Nm_s
-        self.torque_range_Nm = torque_range_Nm
-        names = [signal.name for signal in message.values]
+        names = [signal.name for signal in self._message.values]
         self._status_at = names.index("status") if "status" in names else None
-        self.status_in_header = None if message.profile is None else message.profile.status_place
+        profile = self._message.profile
+        self.status_in_header = None if profile is None else profile.status_place
         self._slow_status_at = -1 if self.status_message is None else self.status_message.place("status")
         self.values = (0.0,)
         """Torque, Nm, as the device gives it: its sign, its own auto-zero, not tared."""

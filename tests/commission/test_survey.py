@@ -56,9 +56,10 @@ def test_who_is_found_is_compared_with_who_is_expected():
         nodes = [dataclasses.replace(node, **changes) for node in found.nodes]
         return compare(dataclasses.replace(found, nodes=nodes), slaves)
 
-    assert compared(product=0x403)[1] == "Drive1 expected; product is not 0x402"
+    assert compared(product=0x403)[1] == "Drive1 expected; product code 0x403 is not the EDS's 0x402"
+    assert compared(revision=0x20001)[1] == "Drive1 expected; revision 0x20001 is not of the EDS's 0x10001"
     assert compared(vendor=None)[1] == "Drive1 expected; tells no vendor"
-    assert compared(device_type=0x20000 | 404)[1] == "Drive1 expected; profile number is not 402"
+    assert compared(device_type=0x20000 | 404)[1].endswith("device type 0x1000 = 0x00020194, 0x00020192 expected")
     assert compare(found, slaves[:1] + slaves[2:])[2] == "unexpected"
     for slave in slaves:
         replace_profile(slave, identity="any")
@@ -72,8 +73,8 @@ def test_a_device_of_the_other_joint_is_known_by_its_serial_number():
         replace_profile(slave, serial=expected)
     differing = {node: verdict for node, verdict in compare(look(rig), rig.master.slaves).items() if verdict}
     assert differing == {
-        1: "Drive1 expected; serial number is not 12",
-        2: "Drive2 expected; serial number is not 11",
+        1: "Drive1 expected; serial number 0x1018:4 = 11, 12 expected",
+        2: "Drive2 expected; serial number 0x1018:4 = 12, 11 expected",
     }
 
 

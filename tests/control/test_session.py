@@ -1,5 +1,6 @@
 """Whole runs against the emulator in one process, with something going wrong; torque is judged on the wire."""
 
+import dataclasses
 import os
 import re
 import signal
@@ -16,6 +17,7 @@ from rig import (
     SessionRig,
     controlwords,
     messages,
+    scripted,
 )
 
 from adacd_hil.control.gate import GateFlag
@@ -39,7 +41,9 @@ LOST, ALIEN, CORRUPT, PASSIVE = (TROUBLE_CYCLE + 100 * k for k in range(4))
 @pytest.fixture(scope="module")
 def disturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SessionSummary, RunLog]:
     """Play a run with two lost torques, an odd EMCY, a corrupt torque, and a controller that is error passive."""
-    rig = SessionRig(tmp_path_factory.mktemp("disturbed"))
+    settings = scripted()
+    settings = dataclasses.replace(settings, bus=dataclasses.replace(settings.bus, heartbeat_ms=10))
+    rig = SessionRig(tmp_path_factory.mktemp("disturbed"), settings)
 
     def tamper(cycle: int, can_id: int, data: bytes) -> bytes | None:
         if can_id == 0x184 and cycle in (LOST, LOST + 1):
@@ -64,6 +68,8 @@ def test_a_disturbed_run_begins_with_a_closed_gate_and_ends_parked_and_disabled_
     assert np.abs(log.scheme["dq"][-1]).max() < 0.01
     assert np.count_nonzero(log.control["tau_c"][:ENABLED_CYCLE]) == 0
     assert set(log.control["gate_flags"][:ENABLED_CYCLE].tolist()) == {int(GateFlag.CLOSED)}
+    beats, commands = (log.topics[f"/decoded/{name}"].t_ns for name in ("HostHeartbeat", "Drive1Command"))
+    assert np.diff([*beats, commands[-1]]).max() <= 10_000_000  # to the last cycle of disabling
 
 
 def test_wrong_frames_change_no_value_and_the_log_says_and_counts_them(

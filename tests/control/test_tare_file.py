@@ -17,6 +17,7 @@ from adacd_hil.control.tare_file import (
 from adacd_hil.dates import format_date
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
+from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 
@@ -111,6 +112,15 @@ def test_a_run_takes_over_the_offset_with_its_deviation_and_nothing_else(tmp_pat
     )
     assert used.apply(SETTINGS) == dataclasses.replace(SETTINGS, arm=arm)
     assert used.warnings == ()
+
+
+def test_the_log_gets_the_tare_that_is_used_where_another_takes_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = stored(tmp_path)
+    text = path.read_bytes()
+    monkeypatch.setattr(Tare, "measured_ns", lambda _: DATE_NS + 0 * path.write_bytes(b"another"))
+    assert use_tare(path, SETTINGS, DATE_NS).attachments() == {TARE_NAME: text}
 
 
 @pytest.mark.parametrize(

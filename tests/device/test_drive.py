@@ -3,14 +3,17 @@
 import dataclasses
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 from loaded import encoded, loaded_contract
 
 import adacd_hil
-from adacd_hil.device.device_files import load_profile
+from adacd_hil.control.fault_recovery import SelfChecks
+from adacd_hil.device.device_files import load_profile, place_devices
 from adacd_hil.device.drive import (
-    IMPLAUSIBLE_JUMP_RAD,
     Cia402State,
     Controlword,
     Drive,
@@ -18,16 +21,19 @@ from adacd_hil.device.drive import (
     option_codes,
     torque_limit_permille,
 )
-from adacd_hil.records import FaultReason
+from adacd_hil.device.profile import PdoSettings, PlausibilitySettings
+from adacd_hil.records import FaultReason, Request, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
 from adacd_hil.wire.codec import Codec, CodecError
-from adacd_hil.wire.dbc_contract import contract_folder, load_codec, parse_codec
+from adacd_hil.wire.dbc_contract import parse_codec
 from adacd_hil.wire.e2e import E2eStatus
 
-CLASSIC, FD = load_codec(), load_codec(contract_folder() / "arm_fd.dbc")
+PAPER, FD_SETTINGS = load_settings("paper"), load_settings("fd")
+CLASSIC, FD = loaded_contract(PAPER), loaded_contract(FD_SETTINGS)
 PERIOD_S = 0.001
+JUMP_RAD = 0.02
 LSB_RAD = 2.0 * math.pi / 2**20
 
 # IEC 61800-7-201, table "state coding": bits 7…0 of the statusword, x where the standard leaves a bit open.
@@ -46,8 +52,18 @@ WANTED = dict(zip(Cia402State, (0x00, 0x06, 0x07, 0x0F, 0x0F, 0x00, 0x00, 0x80),
 """The next controlword of a drive that is to be enabled, by its state; quick stop option code unknown."""
 
 
-def drive(codec: Codec = CLASSIC, **options: int) -> Drive:
-    return Drive(codec, 1, PERIOD_S, **options)
+def drive(settings: Settings = PAPER, codec: Codec = CLASSIC, joint: int = 0, **profile: Any) -> Drive:
+    """A drive of the settings, with changes to its profile."""
+    placed = place_devices(settings)[joint]
+    own = placed.profile._replace(settings=dataclasses.replace(placed.settings, **profile))
+    return Drive(settings, codec, dataclasses.replace(placed, profile=own))
+
+
+def limited(settings: Settings, permille: int) -> Settings:
+    """The settings with a lower torque limit of joint 1."""
+    torque_Nm = permille * 1e-3 * settings.arm.rated_torque_Nm[0]
+    arm = dataclasses.replace(settings.arm, torque_limit_Nm=(torque_Nm, settings.arm.torque_limit_Nm[1]))
+    return dataclasses.replace(settings, arm=arm)
 
 
 def status(statusword: int, mode: int = 10, torque: int = 0, error: int = 0) -> bytes:
@@ -58,8 +74,15 @@ def feedback(position_rad: float, velocity_rad_s: float) -> bytes:
     return bytes(encoded(CLASSIC.message("Drive1Feedback"), position_rad, velocity_rad_s))
 
 
+def with_period(period_ms: int) -> tuple[PdoSettings, ...]:
+    """The frames of a drive, with another period of its status."""
+    periods = {"Status": period_ms}
+    pdos = place_devices(PAPER)[0].settings.pdo
+    return tuple(dataclasses.replace(pdo, event_timer_ms=periods.get(pdo.message, 0)) for pdo in pdos)
+
+
 def in_state(state: Cia402State, mode: int = 10) -> Drive:
-    found = drive()
+    found = drive(quick_stop_option=None)
     found.accept_status(status(WORDS[state], mode), 0)
     return found
 
@@ -149,16 +172,16 @@ def test_fault_reset_rises_once_for_each_fault_and_is_low_before(
 def test_quick_stop_is_left_as_its_option_code_demands(
     option: int | None, statusword: int, velocity: float, controlword: int
 ) -> None:
-    seen = Drive(CLASSIC, 1, PERIOD_S, option)
+    seen = drive(quick_stop_option=option)
     seen.accept_cyclic(feedback(0.0, velocity), 0)
     seen.accept_status(status(statusword), 0)
     assert command_of(seen.command(500, enable=True, quick_stop=False)) == (controlword, 0)
 
 
-@pytest.mark.parametrize("codec", [FD, CLASSIC], ids=["fd", "classic"])
+@pytest.mark.parametrize(("settings", "codec"), [(FD_SETTINGS, FD), (PAPER, CLASSIC)], ids=["fd", "classic"])
 @pytest.mark.parametrize("joint", [1, 2])
-def test_a_drive_that_has_said_nothing_is_nowhere_and_not_ready(joint: int, codec: Codec) -> None:
-    begun = Drive(codec, joint, PERIOD_S)
+def test_a_drive_that_has_said_nothing_is_nowhere_and_not_ready(joint: int, settings: Settings, codec: Codec) -> None:
+    begun = drive(settings, codec, joint - 1)
     assert (begun.name, begun.node_id, begun.command_id) == (f"Drive{joint}", joint, 0x200 + joint)
     assert (begun.values, begun.sample_cycle, begun.status_cycle) == ((0.0, 0.0), -1, -1)
     assert (begun.state, begun.statusword, begun.mode) == (Cia402State.NOT_READY_TO_SWITCH_ON, 0, 0)
@@ -197,9 +220,8 @@ def test_feedback_of_the_wrong_length_is_counted_and_leaves_the_next_frame_as_go
 def test_a_step_is_plausible_up_to_its_bound_off_what_the_velocity_says(
     start_rad: float, velocity_rad_s: float, periods: int, sign: float
 ) -> None:
-    assert IMPLAUSIBLE_JUMP_RAD == 0.02
     expected_rad = start_rad + velocity_rad_s * periods * PERIOD_S
-    for off_rad, is_plausible in ((0.02 - 2 * LSB_RAD, True), (0.02 + 2 * LSB_RAD, False)):
+    for off_rad, is_plausible in ((JUMP_RAD - 2 * LSB_RAD, True), (JUMP_RAD + 2 * LSB_RAD, False)):
         seen = drive()
         seen.accept_cyclic(feedback(start_rad, velocity_rad_s), 5)
         position_rad = expected_rad + sign * off_rad
@@ -210,11 +232,11 @@ def test_a_step_is_plausible_up_to_its_bound_off_what_the_velocity_says(
         assert seen.values == pytest.approx((kept_rad, velocity_rad_s), abs=1e-5)
 
 
-def test_a_status_may_be_as_old_as_its_limit_while_the_drives_are_enabled() -> None:
-    seen = in_state(Cia402State.OPERATION_ENABLED)
-    assert seen.fault(10**9, is_enabled=True) is FaultReason.NONE  # a frame without a period has no age
-    seen.accept_status(status(0x0237), 3)
-    seen.status_age_limit = 40
+def test_a_status_may_be_as_old_as_two_and_a_half_periods_while_the_drives_are_enabled() -> None:
+    silent, seen = (drive(pdo=with_period(period_ms)) for period_ms in (0, 16))
+    for each in (silent, seen):
+        each.accept_status(status(0x0237), 3)
+    assert silent.fault(10**9, is_enabled=True) is FaultReason.NONE  # a frame without a period has no age
     assert [seen.fault(cycle, is_enabled=True) for cycle in (3, 43, 44)] == [
         FaultReason.NONE,
         FaultReason.NONE,
@@ -260,7 +282,7 @@ def test_a_frame_misses_the_last_position_and_the_travel_since(position_rad: flo
 
 
 def test_a_drive_that_may_not_jump_may_stand_still() -> None:
-    seen = Drive(CLASSIC, 1, PERIOD_S, position_jump_rad=0.0)
+    seen = drive(plausibility=PlausibilitySettings(position_jump_rad=0.0))
     assert [seen.accept_cyclic(feedback(0.5, 0.0), cycle) for cycle in (0, 1)] == [True, True]
 
 
@@ -292,18 +314,18 @@ class Sender:
 
 
 def test_protected_feedback_brings_motion_and_status_and_lets_torque_pass() -> None:
-    seen = drive(FD, max_torque_permille=321)
+    seen = drive(limited(FD_SETTINGS, 321), FD)
     assert command_of(seen.command(55, enable=True, quick_stop=False), FD) == (0, 0, 0, 321)
     assert seen.accept_cyclic(Sender().frame(), 7) is True
     assert seen.values == pytest.approx((0.25, -0.5), abs=1e-5)
-    assert (seen.sample_cycle, seen.status_cycle, seen.has_status_frame) == (7, 7, False)
+    assert (seen.sample_cycle, seen.torque_cycle, seen.has_status_frame) == (7, 7, False)
     assert (seen.state, seen.mode) == (Cia402State.OPERATION_ENABLED, 10)
     assert (seen.torque_actual_permille, seen.error_code) == (-120, 0x8130)
     assert command_of(seen.command(55, enable=True, quick_stop=False), FD) == (0x0F, 55, 0, 321)
 
 
 def test_a_protected_frame_that_fails_its_check_changes_nothing() -> None:
-    seen, frame = drive(FD), bytearray(Sender().frame())
+    seen, frame = drive(FD_SETTINGS, FD), bytearray(Sender().frame())
     frame[5] ^= 0x40
     assert seen.accept_cyclic(bytes(frame), 7) is False
     assert (seen.values[0], seen.sample_cycle, seen.status_cycle, seen.statusword) == (0.0, -1, -1, 0)
@@ -312,9 +334,9 @@ def test_a_protected_frame_that_fails_its_check_changes_nothing() -> None:
 
 
 def test_protected_feedback_needs_no_plausibility_and_is_missed_when_it_does_not_come() -> None:
-    seen, sender = drive(FD), Sender()
+    seen, sender = drive(FD_SETTINGS, FD), Sender()
     seen.accept_cyclic(sender.frame(), 0)
-    assert seen.accept_cyclic(sender.frame(0.25 + 10 * IMPLAUSIBLE_JUMP_RAD, 0.0, *FD_VALUES[2:]), 1) is True
+    assert seen.accept_cyclic(sender.frame(0.25 + 10 * JUMP_RAD, 0.0, *FD_VALUES[2:]), 1) is True
     seen.miss()
     assert dict(seen.end_to_end.tally())[E2eStatus.NO_NEW_DATA] == 1
 
@@ -322,11 +344,13 @@ def test_protected_feedback_needs_no_plausibility_and_is_missed_when_it_does_not
 def test_a_contract_without_a_statusword_is_refused() -> None:
     text = FD.text.replace(b"SG_ statusword :", b"SG_ stateword :")
     with pytest.raises(CodecError, match="Drive1: no message carries signal statusword"):
-        drive(parse_codec(text, FD.path))
+        drive(FD_SETTINGS, parse_codec(text, FD.path))
 
 
-def wide_contract(folder: Path, signals: str, command: str = "", status: str = "") -> Codec:
-    """A contract of unprotected drives with the status in the feedback, or in a frame of its own."""
+def wide_drive(
+    folder: Path, signals: str, command: str = "", status: str = "", permille: int = 1000
+) -> tuple[Drive, Codec]:
+    """An unprotected drive with the status in the feedback, or each 16 ms in a frame of its own, and its contract."""
     text = (Path(adacd_hil.__file__).parent / "device_profiles" / "stock-drive.toml").read_text()
     head, _ = text.split("[[pdo]]", 1)
     text = (
@@ -348,64 +372,101 @@ signals = [
 """
     )
     if status:
-        text += f'[[pdo]]\nmessage = "Status"\nnumber = 2\ncob_id = 0x280\nsignals = [{status}]\n'
+        text += f'[[pdo]]\nmessage = "Status"\nnumber = 2\ncob_id = 0x280\nevent_timer_ms = 16\nsignals = [{status}]\n'
     path = folder / "wide.toml"
     path.write_text(text)
     sensor = list(load_settings("stock").devices.sensor)
-    return loaded_contract(
-        parse(
-            Settings,
-            {"devices": {"drive": [str(path)] * 2, "sensor": sensor, "contract": "", "data_bitrate": 5_000_000}},
-        )
+    settings = parse(
+        Settings,
+        {"devices": {"drive": [str(path)] * 2, "sensor": sensor, "contract": "", "data_bitrate": 5_000_000}},
     )
+    codec = loaded_contract(settings)
+    return drive(limited(settings, permille), codec), codec
 
 
 STATUS = '{ object = "0x6041", signal = "statusword" }, '
 MODE = '{ object = "0x6061", signal = "mode_display" }, { object = "0x1001", signal = "error_register" }'
 ERROR = '{ object = "0x603F", signal = "error_code" }'
+TORQUE = '{ object = "0x6077", signal = "torque_actual" }, '
 
 
 def test_the_status_may_travel_in_the_feedback(tmp_path: Path) -> None:
-    codec = wide_contract(tmp_path, STATUS + MODE)
-    arm = drive(codec)
+    arm, codec = wide_drive(tmp_path, STATUS + MODE)
     frame = bytes(encoded(codec.message("Drive1Feedback"), 2.5, 1.0, 0x0237, 10, 0x81))
     assert arm.accept_cyclic(frame, 7)
-    assert (arm.state, arm.mode, arm.status_cycle) == (Cia402State.OPERATION_ENABLED, 10, 7)
+    assert (arm.state, arm.mode, arm.sample_cycle) == (Cia402State.OPERATION_ENABLED, 10, 7)
     assert (arm.has_status_frame, arm.status_message, arm.is_enabled) == (False, None, True)
-    assert (arm.torque_actual_permille, arm.error_code, arm.shows_torque) == (0, 0, False)
+    assert (arm.torque_actual_permille, arm.error_code, arm.torque_cycle) == (0, 0, -1)
 
 
 @pytest.mark.parametrize("first", ["mode_display", "torque_actual", "error_code"])
 def test_a_signal_of_the_status_may_be_the_first_of_its_frame(tmp_path: Path, first: str) -> None:
     objects = {"mode_display": "0x6061", "torque_actual": "0x6077", "error_code": "0x603F"}
     rows = f'{{ object = "{objects[first]}", signal = "{first}" }}, {STATUS}'
-    arm = drive(wide_contract(tmp_path, "", status=rows))
+    arm, _ = wide_drive(tmp_path, "", status=rows)
     assert arm.status_message is not None
     raw = {"mode_display": 9, "torque_actual": -7, "error_code": 0x8130}
     arm.accept_status(bytes(encoded(arm.status_message, raw[first], 0x0237)), 2)
     assert arm.state is Cia402State.OPERATION_ENABLED
     kept = {"mode_display": 10, "torque_actual": 0, "error_code": 0} | {first: raw[first]}
     assert (arm.mode, arm.torque_actual_permille, arm.error_code) == tuple(kept.values())
-    assert arm.shows_torque is (first == "torque_actual")
+    assert arm.torque_cycle == (2 if first == "torque_actual" else -1)
 
 
 def test_the_status_may_travel_in_both_frames(tmp_path: Path) -> None:
-    torque = '{ object = "0x6077", signal = "torque_actual" }, '
-    codec = wide_contract(tmp_path, torque + MODE, status=STATUS + ERROR)
-    arm, feedback = drive(codec), codec.message("Drive1Feedback")
+    arm, codec = wide_drive(tmp_path, TORQUE + MODE, status=STATUS + ERROR)
+    feedback = codec.message("Drive1Feedback")
     assert arm.status_message is not None
     arm.accept_status(bytes(encoded(arm.status_message, 0x0237, 0x8130)), 2)
     assert arm.accept_cyclic(bytes(encoded(feedback, 0.5, 1.0, -7, 10, 0x81)), 3)
     assert (arm.state, arm.statusword, arm.mode) == (Cia402State.OPERATION_ENABLED, 0x0237, 10)
     arm.accept_status(bytes(encoded(arm.status_message, 0x0237, 0x8131)), 4)
-    assert (arm.torque_actual_permille, arm.error_code, arm.shows_torque) == (-7, 0x8131, True)
+    assert (arm.torque_actual_permille, arm.error_code, arm.torque_cycle) == (-7, 0x8131, 3)
     assert arm.accept_cyclic(bytes(encoded(feedback, 0.5, 0.0, -8, 10, 0x81)), 5)
-    assert (arm.torque_actual_permille, arm.error_code, arm.status_cycle) == (-8, 0x8131, 5)
+    assert (arm.torque_actual_permille, arm.error_code, arm.status_cycle) == (-8, 0x8131, 4)
+
+
+@pytest.mark.parametrize(
+    ("cyclic", "status", "fault"),
+    [
+        (TORQUE + MODE, STATUS, FaultReason.DATA_AGE),
+        (TORQUE + STATUS, MODE, FaultReason.DATA_AGE),
+        (STATUS + MODE, TORQUE, FaultReason.NONE),  # it doesn't decide whether the drive is enabled
+    ],
+    ids=["statusword", "mode", "torque"],
+)
+def test_a_status_frame_that_stays_away_is_missed_whatever_the_feedback_brings(
+    tmp_path: Path, cyclic: str, status: str, fault: FaultReason
+) -> None:
+    arm, codec = wide_drive(tmp_path, cyclic, status=status)
+    raw = {"statusword": 0x0237, "mode_display": 10}
+
+    def frame(name: str) -> bytes:
+        message = codec.message(name)
+        return bytes(encoded(message, *(raw.get(signal.name, 0) for signal in message.values)))
+
+    arm.accept_status(frame("Drive1Status"), 3)
+    for cycle in range(3, 45):
+        assert arm.fault(cycle - 1, is_enabled=True) is FaultReason.NONE
+        arm.accept_cyclic(frame("Drive1Feedback"), cycle)
+    assert (arm.is_enabled, arm.fault(44, is_enabled=True)) == (True, fault)
+
+
+def test_a_wrong_torque_counts_once_however_often_the_feedback_brings_the_mode(tmp_path: Path) -> None:
+    arm, codec = wide_drive(tmp_path, f"{MODE}, {ERROR}", status=TORQUE + STATUS)
+    parts: Any = SimpleNamespace(drives=[arm, drive(joint=1)], limits=PAPER.arm, first_difference="", line="")
+    checks = SelfChecks(PAPER, parts, parts, np.zeros(2), parts)
+    requests = []
+    for cycle in range(101):
+        if cycle % 100 == 0:
+            arm.accept_status(bytes(encoded(codec.message("Drive1Status"), 700, 0x0237)), cycle)
+        arm.accept_cyclic(bytes(encoded(codec.message("Drive1Feedback"), 0.5, 0.0, 10, 0, 0)), cycle)
+        requests.append(checks.judge(SimpleNamespace(cycle=cycle, is_enabled=True), SchemeState.ENABLE))  # type: ignore[arg-type]
+    assert requests == [Request.NONE] * 100 + [Request.FAULT_TORQUE]
 
 
 def test_an_implausible_frame_changes_no_status_either(tmp_path: Path) -> None:
-    codec = wide_contract(tmp_path, STATUS + MODE)
-    arm = drive(codec)
+    arm, codec = wide_drive(tmp_path, STATUS + MODE)
     feedback = codec.message("Drive1Feedback")
     arm.accept_cyclic(bytes(encoded(feedback, 0.5, 0.0, 0x0237, 10, 0)), 0)
     assert not arm.accept_cyclic(bytes(encoded(feedback, 1.5, 0.0, 0x0218, 10, 0)), 1)
@@ -413,8 +474,7 @@ def test_an_implausible_frame_changes_no_status_either(tmp_path: Path) -> None:
 
 
 def test_without_a_mode_in_any_frame_the_masters_check_stands(tmp_path: Path) -> None:
-    codec = wide_contract(tmp_path, STATUS + ERROR)
-    arm = drive(codec)
+    arm, codec = wide_drive(tmp_path, STATUS + ERROR)
     assert not arm.is_enabled
     arm.accept_cyclic(bytes(encoded(codec.message("Drive1Feedback"), 0.0, 0.0, 0x0237, 0)), 0)
     assert arm.is_enabled
@@ -422,14 +482,12 @@ def test_without_a_mode_in_any_frame_the_masters_check_stands(tmp_path: Path) ->
 
 def test_the_command_carries_limit_and_offset_where_the_contract_has_them(tmp_path: Path) -> None:
     extra = '{ object = "0x60B2", signal = "torque_offset" }, { object = "0x6072", signal = "max_torque" },'
-    codec = wide_contract(tmp_path, STATUS + ERROR, extra)
-    arm = drive(codec, max_torque_permille=750)
+    arm, codec = wide_drive(tmp_path, STATUS + ERROR, extra, permille=750)
     arm.accept_cyclic(bytes(encoded(codec.message("Drive1Feedback"), 0.0, 0.0, 0x0237, 0)), 0)
     frame = arm.command(-300, enable=True, quick_stop=False)
     assert codec.message("Drive1Command").decode_values(frame) == (0x0F, -300, 0, 750)
 
 
 def test_a_command_signal_that_the_host_cant_fill_is_refused(tmp_path: Path) -> None:
-    codec = wide_contract(tmp_path, STATUS + ERROR, '{ object = "0x60E0", signal = "upper_limit" },')
     with pytest.raises(CodecError, match="Drive1Command: signal upper_limit is none that the host can fill"):
-        drive(codec)
+        wide_drive(tmp_path, STATUS + ERROR, '{ object = "0x60E0", signal = "upper_limit" },')

@@ -1,16 +1,17 @@
 """One joint torque sensor as the host sees it."""
 
-import pytest
-from loaded import encoded
+import dataclasses
 
-from adacd_hil.device.contract import compose
+import pytest
+from loaded import encoded, loaded_contract
+
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
+from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.wire.dbc_contract import load_codec
 
-CODEC = load_codec()
-STOCK = compose(load_settings("stock"), place_devices(load_settings("stock")))
+PAPER, STOCK_SETTINGS = load_settings("paper"), load_settings("stock")
+CODEC, STOCK = loaded_contract(PAPER), loaded_contract(STOCK_SETTINGS)
 OVERLOADED = SensorStatus.POSITIVE_OVERLOAD | SensorStatus.NOT_VALID
 
 
@@ -18,7 +19,7 @@ class Protected:
     """A sensor with an end-to-end header, and its frames."""
 
     def __init__(self) -> None:
-        self.sensor = TorqueSensor(CODEC, 1)
+        self.sensor = TorqueSensor(PAPER, CODEC, place_devices(PAPER)[JOINTS])
         self._sender = CODEC.message("Sensor1Torque").sender()
 
     def frame(self, torque: float, status: int = 0) -> bytes:
@@ -28,7 +29,10 @@ class Protected:
 
 
 def unprotected(range_Nm: float = 0.0) -> TorqueSensor:
-    return TorqueSensor(STOCK, 1, 0.001, 20_000.0, range_Nm)
+    placed = place_devices(STOCK_SETTINGS)[JOINTS]
+    plausibility = dataclasses.replace(placed.settings.plausibility, torque_range_Nm=range_Nm)
+    own = placed.profile._replace(settings=dataclasses.replace(placed.settings, plausibility=plausibility))
+    return TorqueSensor(STOCK_SETTINGS, STOCK, dataclasses.replace(placed, profile=own))
 
 
 def int32(torque: float) -> bytes:

@@ -505,6 +505,17 @@ def test_a_mode_that_is_shown_only_once_the_drive_is_enabled_is_compared_then(sh
     assert rig.wire.sent[-1].data[2:] != bytes(2)
 
 
+def test_a_drive_whose_mode_a_frame_shows_may_refuse_the_reading_of_it() -> None:
+    rig = Rig()
+
+    def refuse(index: int, subindex: int, od: object) -> None:
+        if index == 0x6061:
+            raise canopen.SdoAbortedError(0x08000022)
+
+    rig.drives[0].node.add_read_callback(refuse)
+    rig.boot()
+
+
 def test_a_drive_that_refuses_another_mode_under_halt_is_taken_out_of_it_first() -> None:
     rig = Rig()
     drive = rig.drives[0]

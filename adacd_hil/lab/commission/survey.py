@@ -18,6 +18,7 @@ from adacd_hil.clock import Clock
 from adacd_hil.device.arm_watch import STATES
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
 from adacd_hil.device.device_setup import Slave
+from adacd_hil.device.network import Identity, identity_difference
 from adacd_hil.lab.commission.traffic import Talk, Traffic, listen
 from adacd_hil.lab.stated_bounds import LISTEN_S
 from adacd_hil.wire.bus import Bus, Frame, Tap
@@ -254,36 +255,31 @@ def compare(found: Survey, slaves: Iterable[Slave], codec: Codec | None = None) 
 def _difference(node: Node, slave: Slave, codec: Codec | None) -> str:
     """Return the first difference of a node from its slave as text, "" without one. codec: as of `compare`.
 
-    A node that doesn't answer SDO differs. The serial number must be the profile's. Vendor, product and profile number
-    must be the EDS's if the profile's `identity` is "eds". Those that profile or EDS lack are not compared.
+    A node that doesn't answer SDO differs, and so does one whose identity `run` would refuse.
     """
     if not node.answers:
         return f"{slave.name} expected; does not answer SDO"
-    settings = slave.device.settings
-    vendor, product, device_type = (
-        slave.default(*place) if settings.identity == "eds" and slave.has(*place) else None
-        for place in ((0x1018, 1), (0x1018, 2), (0x1000, 0))
-    )
-    serial = settings.serial[slave.device.joint] if settings.serial else None
-    version, digest = None, None
-    if codec is not None and settings.contract_object:
-        version, digest = codec.wire_version, codec.layout_digest
-    for what, told, value, form in (
-        ("profile number", _low_word(node.device_type), _low_word(device_type), "is not {1}"),
-        ("vendor", node.vendor, vendor, "is not 0x{1:X}"),
-        ("product", node.product, product, "is not 0x{1:X}"),
-        ("serial number", node.serial, serial, "is not {1}"),
-        ("wire version", node.wire_version, version, "0x{0:08X}, the contract has 0x{1:08X}"),
-        ("layout digest", node.layout_digest, digest, "0x{0:08X}, the contract has 0x{1:08X}"),
-    ):
-        if value is not None and told != value:
-            difference = f"tells no {what}" if told is None else f"{what} {form.format(told, value)}"
-            return f"{slave.name} expected; {difference}"
-    return ""
-
-
-def _low_word(number: int | None) -> int | None:
-    return None if number is None else number & 0xFFFF
+    told = {
+        "device type": node.device_type,
+        "vendor": node.vendor,
+        "product code": node.product,
+        "revision": node.revision,
+        "serial number": node.serial,
+        "wire version": node.wire_version,
+        "layout digest": node.layout_digest,
+    }
+    device_type, *identity = (number or 0 for number in list(told.values())[:5])
+    found = Identity(slave.name, node.node_id, *identity)
+    quantity, difference, _ = identity_difference(slave, device_type, found)
+    if codec is not None and slave.device.settings.contract_object and not difference:
+        for quantity, expected in (("wire version", codec.wire_version), ("layout digest", codec.layout_digest)):
+            if told[quantity] != expected:
+                difference = f"0x{told[quantity] or 0:08X}, the contract has 0x{expected:08X}"
+                break
+    if not difference:
+        return ""
+    text = f"tells no {quantity}" if told[quantity] is None else f"{quantity} {difference}"
+    return f"{slave.name} expected; {text}"
 
 
 def message_name(codec: Codec | DbcDecoder, can_id: int) -> str:
