@@ -137,10 +137,10 @@ class Drive(CyclicDevice):
         self._command, self._controlword_at, self._torque_at = _command_template(
             self._command_message, torque_limit_permille(settings, placed.joint)
         )
-        deciding = zip(self._feedback_status[:2], self._status_places[:2], strict=True)
-        self.has_status_frame = any(own < 0 <= other for own, other in deciding)
+        cyclic, slow = self._feedback_status, self._status_places
+        self.has_status_frame = cyclic.statusword < 0 <= slow.statusword or cyclic.mode_display < 0 <= slow.mode_display
         """Whether statusword or mode, which decide whether the drive is enabled, come in a status frame alone."""
-        if max(self._feedback_status.statusword, self._status_places.statusword) < 0:
+        if max(cyclic.statusword, slow.statusword) < 0:
             raise CodecError(f"{self.name}: no message carries signal statusword")
         self._last_controlword = Controlword.DISABLE_VOLTAGE
         self.recent_permille: deque[int] = deque([0], maxlen=_RECENT_COMMANDS)
