@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import math
 import shlex
 from collections.abc import Callable
 from importlib import resources
@@ -162,6 +163,14 @@ def test_the_masses_of_the_file_are_played_and_those_of_a_truth_in_their_place(t
     assert not any("mass" in line or "friction" in line for line in assumed)
     assert (true.mass_kg, true.center_m, true.viscous_Nm_s) == ((3.0, 2.0), (0.2, 0.125), (0.02, 0.01))
     assert true.coulomb_Nm == (0.5, 0.4)
+
+
+@pytest.mark.parametrize(("share", "rel"), [(0.0, 1e-4), (0.3, 1e-4), (0.97, 1e-4), (1.0, 0.02)])
+def test_the_links_have_the_inertia_of_the_cad_model(share: float, rel: float, tmp_path: Path) -> None:
+    theta = [0.2, math.sqrt(share * 0.16 * 0.04), 0.04]
+    scenario, _ = composed(tmp_path, f"[arm]\nlink_length_m = [0.4, 0.25]\ncad_theta = {[*theta, 0, 0, 0, 0]}\n")
+    alpha, beta, gamma = scenario.arm.inertia()
+    assert [alpha + gamma, beta, gamma] == pytest.approx(theta, rel=rel)
 
 
 def test_the_host_has_no_use_for_what_the_emulator_plays(tmp_path: Path) -> None:
