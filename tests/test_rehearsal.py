@@ -133,6 +133,27 @@ def test_a_truth_that_no_file_names_is_refused_with_the_nearest_name(folder: Pat
     assert "wrong-length" in lines.splitlines()[-1]
 
 
+TEN = "`mechanics.tilt_deg` = 'ten' must be of type float"
+
+
+@pytest.mark.parametrize(
+    ("scenario", "truth", "said"),
+    [
+        ("sensors = 3", "", "scenario wrong.toml: `sensors` = 3 must be a table"),
+        ("sensors = 3", "sensors.encoder_bits = [18, 18]", "scenario wrong.toml: `sensors` = 3 must be a table"),
+        ("", "mechanics = 3", "truth lie.toml: `mechanics` = 3 must be a table"),
+        ("sensors.torque_range_Nm = 50.0", "", "scenario wrong.toml: `sensors.torque_range_Nm` = 50.0 must be a list"),
+        ("mechanics.tilt_deg = 'ten'", "", f"scenario wrong.toml: {TEN}"),
+        ("", "mechanics.tilt_deg = 'ten'", f"scenario wrong.toml with truth lie.toml: {TEN}"),
+    ],
+)
+def test_a_wrong_section_of_a_scenario_or_truth_is_refused(folder: Path, scenario: str, truth: str, said: str) -> None:
+    (folder / "wrong.toml").write_text(f"{scenario}\n")
+    (folder / "lie.toml").write_text(f"{truth}\n")
+    status, lines = rehearse(folder, "wrong", *(("--truth", "lie.toml") if truth else ()), scenario="wrong.toml")
+    assert (status, lines.splitlines()[-1]) == (2, f"adacd-hil: {said}")
+
+
 BODY = """
 [arm]
 link_length_m = [0.4, 0.25]
