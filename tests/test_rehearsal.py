@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import math
 import shlex
 from collections.abc import Callable
 from importlib import resources
@@ -132,6 +133,27 @@ def test_a_truth_that_no_file_names_is_refused_with_the_nearest_name(folder: Pat
     assert "wrong-length" in lines.splitlines()[-1]
 
 
+TEN = "`mechanics.tilt_deg` = 'ten' must be of type float"
+
+
+@pytest.mark.parametrize(
+    ("scenario", "truth", "said"),
+    [
+        ("sensors = 3", "", "scenario wrong.toml: `sensors` = 3 must be a table"),
+        ("sensors = 3", "sensors.encoder_bits = [18, 18]", "scenario wrong.toml: `sensors` = 3 must be a table"),
+        ("", "mechanics = 3", "truth lie.toml: `mechanics` = 3 must be a table"),
+        ("sensors.torque_range_Nm = 50.0", "", "scenario wrong.toml: `sensors.torque_range_Nm` = 50.0 must be a list"),
+        ("mechanics.tilt_deg = 'ten'", "", f"scenario wrong.toml: {TEN}"),
+        ("", "mechanics.tilt_deg = 'ten'", f"scenario wrong.toml with truth lie.toml: {TEN}"),
+    ],
+)
+def test_a_wrong_section_of_a_scenario_or_truth_is_refused(folder: Path, scenario: str, truth: str, said: str) -> None:
+    (folder / "wrong.toml").write_text(f"{scenario}\n")
+    (folder / "lie.toml").write_text(f"{truth}\n")
+    status, lines = rehearse(folder, "wrong", *(("--truth", "lie.toml") if truth else ()), scenario="wrong.toml")
+    assert (status, lines.splitlines()[-1]) == (2, f"adacd-hil: {said}")
+
+
 BODY = """
 [arm]
 link_length_m = [0.4, 0.25]
@@ -162,6 +184,14 @@ def test_the_masses_of_the_file_are_played_and_those_of_a_truth_in_their_place(t
     assert not any("mass" in line or "friction" in line for line in assumed)
     assert (true.mass_kg, true.center_m, true.viscous_Nm_s) == ((3.0, 2.0), (0.2, 0.125), (0.02, 0.01))
     assert true.coulomb_Nm == (0.5, 0.4)
+
+
+@pytest.mark.parametrize(("share", "rel"), [(0.0, 1e-4), (0.3, 1e-4), (0.97, 1e-4), (1.0, 0.02)])
+def test_the_links_have_the_inertia_of_the_cad_model(share: float, rel: float, tmp_path: Path) -> None:
+    theta = [0.2, math.sqrt(share * 0.16 * 0.04), 0.04]
+    scenario, _ = composed(tmp_path, f"[arm]\nlink_length_m = [0.4, 0.25]\ncad_theta = {[*theta, 0, 0, 0, 0]}\n")
+    alpha, beta, gamma = scenario.arm.inertia()
+    assert [alpha + gamma, beta, gamma] == pytest.approx(theta, rel=rel)
 
 
 def test_the_host_has_no_use_for_what_the_emulator_plays(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Sequence
 from fractions import Fraction
 from importlib import resources
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import place_devices
@@ -35,6 +35,7 @@ from firmware_sim.canopen.object_dictionary import (
 from firmware_sim.nodes.drive_node import CYCLIC_SYNCHRONOUS_TORQUE
 from firmware_sim.scenario.rehearsal import DeviceCounts, compose_scenario, told_arm
 from firmware_sim.scenario.scenario import (
+    SCENARIO_SECTIONS,
     ArmTruth,
     Scenario,
     builtin_scenarios,
@@ -137,10 +138,7 @@ def rehearse_settings(
             codec, contract_of(codec), resolve_scenario(scenario_name, table, settings.arm.profile, seed), []
         )
     truth, sections = load_truth(truth_name) if truth_name is not None else (ArmTruth(), {})
-    for name, section in sections.items():
-        if not isinstance(section, dict):
-            raise ConfigError(f"truth {truth_name}: `{name}` = {section!r} must be a table")
-        table[name] = {**table.get(name, {}), **section}
+    _lay_over(f"scenario {scenario_name}", table, f"truth {truth_name}", sections)
     composed, assumed = compose_scenario(told, truth, _counts(codec, devices), table, is_builtin)
     composed["truth"] = truth.name
     habits = [truth.habits or _maker_habits(device) for device in devices[:JOINTS]]
@@ -149,6 +147,23 @@ def rehearse_settings(
     scenario = resolve_scenario(scenario_name, composed, settings.arm.profile, seed)
     contract = describe_devices(codec, devices, settings)
     return Rehearsal(codec, contract, scenario, [*assumed, *_omissions(devices, contract)])
+
+
+def _lay_over(scenario: str, table: dict[str, Any], truth: str, sections: dict[str, Any]) -> None:
+    """Lay a truth's sections over those of a scenario's table, in place. scenario, truth: names, for errors.
+
+    Raises ConfigError for a section that is no table, or that is wrong once it is laid over.
+    """
+    for name, settings in SCENARIO_SECTIONS.items():
+        said, true = table.get(name, {}), sections.get(name, {})
+        for place, section in ((scenario, said), (truth, true)):
+            if not isinstance(section, dict):
+                raise ConfigError(f"{place}: `{name}` = {section!r} must be a table")
+        table[name] = said | true
+        try:
+            parse(settings, table[name], f"{name}.")
+        except ConfigError as error:
+            raise ConfigError(f"{scenario}{f' with {truth}' if true else ''}: {error}") from None
 
 
 def _omissions(devices: list[PlacedDevice], contract: EmulatedContract) -> list[str]:

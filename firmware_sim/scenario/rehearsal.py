@@ -219,8 +219,8 @@ def _place_links(told: ToldArm, truth: ArmTruth, assumed: list[str]) -> _Links:
     elif "arm.cad_theta" in told.own_keys and arm.cad_theta:
         links = _from_cad(told_m, arm.cad_theta)
         assumed.append(
-            f"links of {links.mass_kg[0]:.3g} and {links.mass_kg[1]:.3g} kg whose inertia is arm.cad_theta's to the "
-            "digit; --truth with arm.mass_kg plays another"
+            f"links of {links.mass_kg[0]:.3g} and {links.mass_kg[1]:.3g} kg whose inertia is arm.cad_theta's within "
+            "2 %; --truth with arm.mass_kg plays another"
         )
     else:
         links = _rods(told_m, _heavy_enough(told_m, arm.rated_torque_Nm))
@@ -280,7 +280,8 @@ def _heavy_enough(length_m: Pair, rated_Nm: Pair) -> Pair:
 def _from_cad(length_m: Pair, theta: Sequence[float]) -> _Links:
     """Return two links with the inertia of `theta`, which is `arm.cad_theta`.
 
-    Raises ConfigError if no links can have it.
+    With a2² above 0.98 (a1 - a3) a3, a1 is up to 2 % larger, so that the outstretched arm keeps an inertia against each
+    motion. Raises ConfigError if no links can have it.
     """
     a1, a2, a3 = theta[:3]
     l1, l2 = length_m

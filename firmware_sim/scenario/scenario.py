@@ -298,7 +298,8 @@ def named_profile(name_or_file: str) -> str | None:
 
 
 _SAME: Final = (1.0, 1.0)
-SCENARIO_SECTIONS = ("sensors", "drives", "mechanics")
+SCENARIO_SECTIONS: Final = {"sensors": SensorSettings, "drives": DriveSettings, "mechanics": MechanicsSettings}
+"""Sections that a truth lays over those of a scenario."""
 
 
 @dataclass(frozen=True)
