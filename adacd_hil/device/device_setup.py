@@ -459,7 +459,7 @@ class ParameterWatch(RateLimitedEvents):
             code = int.from_bytes(data[4:], "little")
             text = f"{asked.name} can't be read again: 0x{code:08X}"
             self.report(frame.t_ns, asked.name, Event("warning", "parameters", text))
-            self._objects.remove(asked)
+            self._objects = deque(one for one in self._objects if one is not asked)
         elif data[0] & 0xE2 == 0x42:  # expedited, with or without its size
             size = 4 - (data[0] >> 2 & 3) if data[0] & 1 else 4
             self._compare(asked, int.from_bytes(data[4 : 4 + size], "little"), size)
