@@ -321,7 +321,8 @@ def _log_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> None:
 def _serve(service: Service) -> None:
     """Request real-time priority, announce the nodes, print "ready" on stderr, and serve until the end.
 
-    Print a line on stderr for each part of the priority that isn't granted. Raises BusError as `Service.run`.
+    Print a line on stderr for each part of the priority that isn't granted, and, at the end, for a host that was lost.
+    Raises BusError as `Service.run`.
     """
     # As a host does: with less, on a processor that both share and fill, the arm would never answer in time.
     for line in request_realtime().missing:
@@ -330,6 +331,8 @@ def _serve(service: Service) -> None:
     service.boot()
     print("ready", file=sys.stderr, flush=True)
     service.run()
+    if service.is_host_lost:
+        _complain("the host was silent for 2 s, with the drives in Operational")
 
 
 def _make_folder(path: Path) -> None:

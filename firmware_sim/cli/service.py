@@ -56,6 +56,8 @@ class Service:
         self._time_ns = 0  # up to here the bench's time has followed the clock
         self._heard_ns = 0  # last frame
         self._gone_ns = NEVER_NS  # when the host was found to have gone
+        self.is_host_lost = False
+        """Whether a host was silent for `_SILENCE_NS` while a drive was Operational."""
 
     def boot(self) -> None:
         """Drop frames that wait on the bus, power the bench on, and send the boot-up messages.
@@ -130,6 +132,7 @@ class Service:
         """
         is_silent = now_ns - self._heard_ns > _SILENCE_NS
         if is_silent:
+            self.is_host_lost = self.is_host_lost or not self._is_left
             self._bench.outlive_host()
         if self._bench.is_paced:
             self._time_ns = now_ns
@@ -145,8 +148,11 @@ class Service:
 
     def _is_host_gone(self) -> bool:
         is_silent = self._clock.now_ns() - self._heard_ns > _SILENCE_NS
-        is_left = not any(device.is_operational for device in self._bench.devices[:JOINTS])
-        return self._has_been_operational and (is_silent or is_left)
+        return self._has_been_operational and (is_silent or self._is_left)
+
+    @property
+    def _is_left(self) -> bool:
+        return not any(device.is_operational for device in self._bench.devices[:JOINTS])
 
     def _is_settled(self) -> bool:
         """Return whether the arm of a host that has gone is at rest, or has had its time by wall clock.

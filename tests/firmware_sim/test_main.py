@@ -114,7 +114,9 @@ def test_the_truth_log_says_at_which_cycle_a_fault_began_and_ended(monkeypatch, 
     scenario.write_text(LOST_TORQUE)
     options = ("--scenario", str(scenario), "--clock", clock_mode, "--out", str(tmp_path), "--once", "--json")
     assert run_main("run", "-i", "scripted", "-c", "scripted", *options) == 0
-    assert json.loads(capsys.readouterr().out)["cycles"] == 60
+    told = capsys.readouterr()
+    assert json.loads(told.out)["cycles"] == 60
+    assert told.err.splitlines()[-1] == "firmware-sim: the host was silent for 2 s, with the drives in Operational"
     log = read_log(tmp_path / "truth.mcap")
     edges = np.flatnonzero(np.diff(log.truth["faults"])) + 1
     assert [(entry.t_ns, entry.event.message.split(":")[0]) for entry in log.events] == [
