@@ -416,7 +416,7 @@ def test_contacts_of_a_later_attempt_are_counted_from_its_beginning(log, monkeyp
     monkeypatch.setattr(free_motion, "contacts_beside", lambda *_: known._replace(contacts=later))
     (read,) = read_logs([log])
     cycle = read_log(log, ("/scheme",)).scheme["cycle"]
-    gap = 1205 - first.onset  # between the attempts
+    gap = 1204 - first.onset  # between the attempts
     counted = [(window.number, cycle[window.first] - first.onset) for window in read.windows]
     assert counted == [(1, gap), (2, SECOND_ATTEMPT)]
 

@@ -23,7 +23,7 @@ from adacd_hil.scheme.supervisor import findings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings, merge
 from adacd_hil.settings.parsing import parse
-from firmware_sim.arm.sensing import DriveMode
+from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S, DriveMode, Measurement
 from firmware_sim.arm.touch_settings import ticks
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario
@@ -127,10 +127,13 @@ class Rig:
         self._body.truth(truth)
         return truth[_TRUTH["theta"]]
 
-    def _arm(self, sample: Any) -> ArmState:
+    def _arm(self, sample: Measurement) -> ArmState:
         return ArmState(
-            self._cycle, self._cycle * 1_000_000, 1, sample.q, sample.dq, sample.tau_J, (0, 0), (0, 0), True, True,
-            FaultReason.NONE,
+            self._cycle, self._cycle * 1_000_000, 1,
+            np.array(sample.position_counts) * POSITION_LSB_RAD,
+            np.array(sample.velocity_counts) * VELOCITY_LSB_RAD_S,
+            np.array(sample.torque_counts) * TORQUE_LSB_NM,
+            (0, 0), (0, 0), True, True, FaultReason.NONE,
         )  # fmt: skip
 
     def _look(self, arm: ArmState) -> int:
