@@ -48,6 +48,8 @@ BIN = Path(sys.executable).parent
 FAULTS = ("corrupt-torque", "drive-fault-and-recovery", "lose-feedback", "power-loss-and-return", "stuck-torque")
 STORED_LOG = ROOT / "tests" / "reference" / "logs" / "recovery.mcap"
 LEFT_OUT = ("adacd_hil/lab/", "adacd_hil/api.py", "adacd_hil/cli/completion.py")
+BY_RUN, BY_WAY = "run", "way"
+"""The context in which Coverage.py counts a line: a reference run or a scenario, and their replays; or a user's way."""
 _MOST_FILES = 25
 
 
@@ -88,9 +90,12 @@ def main() -> int:
         trials = [*(arguments.names or known), str(STORED_LOG)]
         played = list(play_trials(partial(_play_apart, environment=environment), trials, arguments.jobs, _line))
         failed = [each for each in played if each.error]
+        _combine(folder, environment)
+        alone = _report(folder, environment, "--contexts", BY_RUN)
         report = _report(folder, environment)
     if arguments.json:
         arguments.json.write_text(json.dumps(report), encoding="utf-8")
+    print(f"reference runs and faults alone: {_share(alone)}\n\nwith a user's ways: {_share(report)}")
     _print(report, arguments.functions)
     for each in failed:
         print(f"{each.name}: {each.error}", file=sys.stderr)
@@ -181,8 +186,9 @@ def _play_apart(name: str, environment: dict[str, str]) -> Played:
         log = f"Path({name!r})" if name.endswith(".mcap") else f"reached_lines.play({name!r}, {folder})"
         call = f"WAYS[{name!r}]({folder})" if name in WAYS else f"replay({log})"
         program = f"import reached_lines; from pathlib import Path; reached_lines.{call}"
+        own = {**environment, "REACHED_BY": BY_WAY if name in WAYS else BY_RUN}
         done = subprocess.run(
-            [sys.executable, "-c", program], env=environment, cwd=ROOT, capture_output=True, text=True, check=False
+            [sys.executable, "-c", program], env=own, cwd=ROOT, capture_output=True, text=True, check=False
         )
     said = done.stderr.strip().splitlines() or [""]
     return Played(Path(name).stem, f"exit status {done.returncode}: {said[-1]}" if done.returncode else "")
@@ -204,6 +210,7 @@ def _environment(folder: Path) -> dict[str, str]:
     (packages / "sitecustomize.py").write_text("import coverage\ncoverage.process_startup()\n", encoding="utf-8")
     settings.write_text(
         f"[run]\nparallel = true\nsource = {ROOT / 'adacd_hil'}\ndata_file = {folder / 'data'}\n"
+        "context = ${REACHED_BY}\n"
         "disable_warnings = no-data-collected,module-not-measured,module-not-imported\n",
         encoding="utf-8",
     )
@@ -216,16 +223,23 @@ def _environment(folder: Path) -> dict[str, str]:
     }
 
 
-def _report(folder: Path, environment: dict[str, str]) -> dict[str, Any]:
+def _combine(folder: Path, environment: dict[str, str]) -> None:
     """Join what the processes have measured."""
-    own = {key: value for key, value in environment.items() if key != "COVERAGE_PROCESS_START"}
-    program = [sys.executable, "-m", "coverage"]
-    settings = f"--rcfile={folder / 'coveragerc'}"
+    _coverage(["combine", "--quiet"], folder, environment)
+
+
+def _report(folder: Path, environment: dict[str, str], *options: str) -> dict[str, Any]:
+    """Return Coverage.py's report of what was joined."""
     report = folder / "report.json"
-    for words in (["combine", "--quiet", settings], ["json", "--quiet", settings, "-o", str(report)]):
-        subprocess.run([*program, *words], env=own, cwd=ROOT, check=True)
+    _coverage(["json", "--quiet", "-o", str(report), *options], folder, environment)
     found: dict[str, Any] = json.loads(report.read_text(encoding="utf-8"))
     return found
+
+
+def _coverage(words: list[str], folder: Path, environment: dict[str, str]) -> None:
+    own = {key: value for key, value in environment.items() if key != "COVERAGE_PROCESS_START"}
+    command = [sys.executable, "-m", "coverage", *words, f"--rcfile={folder / 'coveragerc'}"]
+    subprocess.run(command, env={**own, "REACHED_BY": BY_RUN}, cwd=ROOT, check=True)
 
 
 def is_counted(path: str) -> bool:
@@ -242,13 +256,23 @@ def _functions(files: dict[str, Any]) -> Iterator[tuple[str, str, Reached]]:
                 yield path, name, Reached(summary["covered_lines"], summary["num_statements"])
 
 
+def _counted(report: dict[str, Any]) -> dict[str, Any]:
+    """Return the part of a report of each file that counts."""
+    return {path: file for path, file in report["files"].items() if is_counted(path)}
+
+
+def _share(report: dict[str, Any]) -> str:
+    """Return in words how much of all lines, and of the lines within functions, was reached."""
+    files = _counted(report)
+    whole = _sum(_of(file["summary"]) for file in files.values())
+    within = _sum(reached for _, _, reached in _functions(files))
+    return f"{whole.percent} of {whole.lines} lines reached; within functions {within.percent} of {within.lines}"
+
+
 def _print(report: dict[str, Any], names_functions: bool) -> None:
-    files = {path: file for path, file in report["files"].items() if is_counted(path)}
+    files = _counted(report)
     lines = {path: _of(file["summary"]) for path, file in files.items()}
     functions = list(_functions(files))
-    within = _sum(reached for _, _, reached in functions)
-    whole = _sum(lines.values())
-    print(f"{whole.percent} of {whole.lines} lines reached; within functions {within.percent} of {within.lines}")
     packages: dict[str, list[Reached]] = {}
     for path, reached in lines.items():
         packages.setdefault(str(Path(path).parent), []).append(reached)
