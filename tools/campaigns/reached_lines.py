@@ -7,9 +7,9 @@
 Plays each run of `tests/reference` and five scenarios of the emulator without compilation, the log's writer included,
 then replays each log and the stored one. Then come five of a user's ways: a tare and two runs with a history, by the
 commands; a run on vcan; a look at configurations; a replay of frames that another program recorded; a replay with other
-settings. A line counts once it was executed; importing a module reaches the lines that define its functions, so the
-share of lines within functions is told apart. Neither the emulator nor what a run and its replay do without
-(`LEFT_OUT`) counts.
+settings. The share of runs and faults alone is printed first. A line counts once it was executed; importing a module
+reaches the lines that define its functions, so the share of lines within functions is told apart. Neither the emulator
+nor what a run and its replay do without (`LEFT_OUT`) counts.
 
 Coverage.py is in no lock. Where it can't be imported, pip fetches it into a folder that is removed.
 Exit status: 0 measured, 1 a run or a replay failed, 2 wrong usage.
