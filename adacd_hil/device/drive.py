@@ -85,6 +85,8 @@ class _StatusPlaces(NamedTuple):
 
 
 _NO_STATUS = _StatusPlaces()
+_JUDGED = ("statusword", "mode_display", "torque_actual")
+"""What the host judges of a status: whether the drive is enabled, and its torque. It only shows the error code."""
 
 
 def option_codes(settings: Settings, profile: ProfileSettings) -> tuple[int | None, int | None]:
@@ -138,8 +140,8 @@ class Drive(CyclicDevice):
             self._command_message, torque_limit_permille(settings, placed.joint)
         )
         cyclic, slow = self._feedback_status, self._status_places
-        self.has_status_frame = cyclic.statusword < 0 <= slow.statusword or cyclic.mode_display < 0 <= slow.mode_display
-        """Whether statusword or mode, which decide whether the drive is enabled, come in a status frame alone."""
+        self.has_status_frame = any(getattr(cyclic, name) < 0 <= getattr(slow, name) for name in _JUDGED)
+        """Whether statusword, mode or actual torque, which the host judges, come in a status frame alone."""
         if max(cyclic.statusword, slow.statusword) < 0:
             raise CodecError(f"{self.name}: no message carries signal statusword")
         self._last_controlword = Controlword.DISABLE_VOLTAGE

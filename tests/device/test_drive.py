@@ -431,9 +431,10 @@ def test_the_status_may_travel_in_both_frames(tmp_path: Path) -> None:
     [
         (TORQUE + MODE, STATUS, FaultReason.DATA_AGE),
         (TORQUE + STATUS, MODE, FaultReason.DATA_AGE),
-        (STATUS + MODE, TORQUE, FaultReason.NONE),  # it doesn't decide whether the drive is enabled
+        (STATUS + MODE, TORQUE, FaultReason.DATA_AGE),
+        (STATUS + MODE, ERROR, FaultReason.NONE),  # the host only shows it
     ],
-    ids=["statusword", "mode", "torque"],
+    ids=["statusword", "mode", "torque", "error code"],
 )
 def test_a_status_frame_that_stays_away_is_missed_whatever_the_feedback_brings(
     tmp_path: Path, cyclic: str, status: str, fault: FaultReason
