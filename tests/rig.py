@@ -1,7 +1,7 @@
 """Host and emulated arm at the two ends of one embedded bus, in virtual time: what tests of the host are built on."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.pacing import GridPacer
-from adacd_hil.control.session import Session, SessionSummary
+from adacd_hil.control.session import ArmFile, Session, SessionSummary
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.network import Master
@@ -179,14 +179,14 @@ class SessionRig(Rig):
         *,
         finish_s: float = 2.0,
         acknowledge_faults: int = 0,
+        files: Sequence[ArmFile] = (),
         **parts: Any,
     ) -> None:
         settings = settings or scripted(finish_s=finish_s, acknowledge_faults=acknowledge_faults)
         super().__init__(settings, scenario, **parts)
-        operator = ScriptedOperator(settings.operator)
-        self.session = Session(
-            settings, self.codec, place_devices(settings), self.host_bus, self.clock, operator, folder, "embedded"
-        )
+        operator, devices = ScriptedOperator(settings.operator), place_devices(settings)
+        host = settings, self.codec, devices, self.host_bus, self.clock, operator, folder, "embedded"
+        self.session = Session(*host, files=files)
 
     def run(self) -> tuple[SessionSummary, RunLog]:
         summary = self.session.run()

@@ -1,6 +1,7 @@
 """Short runs whose decisions and bits are stored: a change that alters live and replay together is seen.
 
-Each run is two files in `runs/`: NAME.config.toml and NAME.scenario.toml. What it came to is stored in NAME.json:
+Each run is two files in `runs/`: NAME.config.toml and NAME.scenario.toml; a run of a known arm has its tare and its
+history beside, NAME.tare.toml and NAME.history.toml. What it came to is stored in NAME.json:
 
 - decisions: every transition with its cycle, every final contact report, the fault, the model at the end. Compared on
   every machine, within `CYCLES` cycles and `SHARE` of a value.
@@ -16,6 +17,8 @@ import hashlib
 import itertools
 import json
 import platform
+import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -23,13 +26,17 @@ from typing import Any
 
 import llvmlite.binding
 import numpy as np
+from experiment_runs import Played, emulator, run_on_vcan
 from loaded import loaded_contract
 from numpy.typing import NDArray
 from rig import SessionRig
 from two_arms_rig import TwoArms
 
+from adacd_hil.clock import wall_ns
+from adacd_hil.control.history_file import UsedHistory, use_history
 from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.session import Session
+from adacd_hil.control.tare_file import UsedTare, use_tare
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.log.reader import RunLog, Series, read_log
 from adacd_hil.records import Request, SchemeState
@@ -53,6 +60,11 @@ _DIGEST_BYTES = 4
 def names() -> list[str]:
     """Name the reference runs."""
     return sorted(path.name.removesuffix(".config.toml") for path in RUNS.glob("*.config.toml"))
+
+
+def known_arm(name: str) -> tuple[Path, Path]:
+    """Give the paths of a run's tare and history, which only a known arm has."""
+    return RUNS / f"{name}.tare.toml", RUNS / f"{name}.history.toml"
 
 
 def arithmetic() -> dict[str, str]:
@@ -84,20 +96,46 @@ def play(name: str, folder: Path, cycles: int = 0) -> RunLog:
     """Play a reference run in lockstep and read its log. `cycles`: end after so many; 0: at its end."""
     settings = load_settings(str(RUNS / f"{name}.config.toml"))
     scenario = load_scenario(str(RUNS / f"{name}.scenario.toml"), settings.arm.profile)
+    files = _files(name, settings)
+    for file in files:
+        settings = file.apply(settings)
     operator = _StoppingOperator(settings.operator)
-    session = _session(settings, scenario, operator, folder)
+    session = _session(settings, scenario, operator, folder, files)
     operator.session, operator.cycles_left = session, cycles
     return read_log(session.run().log.path)
 
 
-def _session(settings: Settings, scenario: Scenario, operator: Operator, folder: Path) -> Session:
+def play_on_vcan(name: str, folder: Path) -> Played:
+    """Play a reference run with an arm of the emulator's by the commands, on vcan0; a known arm's files are copied."""
+    known = [shutil.copy(path, folder) for path in known_arm(name) if path.exists()]
+    options = [word for option, path in zip(("--tare", "--history"), known, strict=False) for word in (option, path)]
+    with emulator(folder, "--scenario", str(RUNS / f"{name}.scenario.toml")):
+        config = ("--config", str(RUNS / f"{name}.config.toml"))
+        return run_on_vcan(folder, "--clock", "lockstep", *config, *options)
+
+
+def _files(name: str, settings: Settings) -> list[UsedTare | UsedHistory]:
+    """Take the tare and the history of a run whose arm is known; none for others."""
+    tare, history = known_arm(name)
+    if not tare.exists():
+        return []
+    return [use_tare(tare, settings, wall_ns()), use_history(history, wall_ns())]
+
+
+def _session(
+    settings: Settings,
+    scenario: Scenario,
+    operator: Operator,
+    folder: Path,
+    files: Sequence[UsedTare | UsedHistory],
+) -> Session:
     """Prepare a host and its arm: alone on the bus, or behind another arm whose host sends SYNC."""
     codec = loaded_contract(settings)
     if settings.bus.follows:
         arms = TwoArms(settings, scenario)
         return Session(settings, codec, place_devices(settings), arms.end, arms.clock, operator, folder, "embedded")
     own = None if settings.devices.contract else describe_devices(codec, place_devices(settings), settings)
-    rig = SessionRig(folder, settings, scenario, codec=codec, contract=own, is_modelled=True)
+    rig = SessionRig(folder, settings, scenario, files=files, codec=codec, contract=own, is_modelled=True)
     rig.session.operator = operator
     return rig.session
 

@@ -7,7 +7,9 @@ reaction, an acknowledgement, a second attempt, and torque frames that get lost.
 
 import json
 from pathlib import Path
+from typing import Any
 
+import can
 import pytest
 from called import called
 
@@ -26,17 +28,43 @@ STATES = [
     (433, "CERTIFY"),
     (453, "MONITOR"),
 ]
+THRESHOLD_NM = [0.44060, 0.50450]
+THRESHOLD_AT_13_SIGMAS_NM = [0.44229, 0.50846]
+
+pytestmark = pytest.mark.slow
 
 
-@pytest.mark.slow
-def test_a_log_of_today_replays_to_the_same_decisions() -> None:
-    """Bit for bit where the numbers are computed as they were; else within the tolerance that `replay` chooses."""
-    done = called("replay", str(LOG), "--json")
+def replayed(path: Path, *options: object) -> dict[str, Any]:
+    """Replay by the command; give what it found."""
+    done = called("replay", path, "--json", *options)
     assert done.exit_code == 0, done.output
     (found,) = json.loads(done.stdout)
     assert (found["cycles"], found["compared"], found["attempts"]) == (655, 655, 2)
     assert (found["identical"], found["notes"]) == (True, [])
+    return found
+
+
+def test_a_log_of_today_replays_to_the_same_decisions() -> None:
+    """Bit for bit where the numbers are computed as they were; else within the tolerance that `replay` chooses."""
+    found = replayed(LOG)
     states = found["original"]["states"]
     assert [(each["cycle"], each["to"]) for each in states] == STATES
     assert [each["fault"] for each in states if each["to"] == "FAULT"] == ["DRIVE"]
     assert len(found["original"]["detections_s"]) == 1
+
+
+def test_its_frames_in_another_programs_recording_come_to_the_same_decisions(tmp_path: Path) -> None:
+    recording = tmp_path / "candump.log"
+    with can.LogReader(LOG) as reader, can.Logger(recording) as writer:
+        for message in reader:
+            writer(message)
+    found = replayed(recording, "--against", LOG)
+    assert found["original"]["detections_s"] == [0.46]
+
+
+def test_other_settings_come_to_other_thresholds() -> None:
+    found = replayed(LOG, "--set", "certified.noise_sigmas=13")
+    (variant,) = found["variants"]
+    assert found["original"]["threshold_Nm"] == pytest.approx(THRESHOLD_NM, rel=1e-4)
+    assert variant["threshold_Nm"] == pytest.approx(THRESHOLD_AT_13_SIGMAS_NM, rel=1e-4)
+    assert variant["detections_s"] == found["original"]["detections_s"]

@@ -5,11 +5,10 @@
     python tools/campaigns/reached_lines.py paper-quick lose-feedback     these runs alone
 
 Plays each run of `tests/reference` and five scenarios of the emulator without compilation, the log's writer included,
-then replays each log and the stored one. Then come five of a user's ways: a tare and two runs with a history, by the
-commands; a run on vcan; a look at configurations; a replay of frames that another program recorded; a replay with other
-settings. The share of runs and faults alone is printed first. A line counts once it was executed; importing a module
-reaches the lines that define its functions, so the share of lines within functions is told apart. Neither the emulator
-nor what a run and its replay do without (`LEFT_OUT`) counts.
+and replays each log. The run of a known arm comes once more by the commands, on vcan; the stored log is replayed as it
+is, as frames that another program recorded, and with another setting. A line counts once it was executed; importing a
+module reaches the lines that define its functions, so the share of lines within functions is told apart. Neither the
+emulator nor what a run and its replay do without (`LEFT_OUT`) counts.
 
 Coverage.py is in no lock. Where it can't be imported, pip fetches it into a folder that is removed.
 Exit status: 0 measured, 1 a run or a replay failed, 2 wrong usage.
@@ -38,18 +37,13 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "reference")]
 
 import can  # noqa: E402
-import pytest  # noqa: E402
 import reference_runs  # noqa: E402 (it is the tests')
-from called import called  # noqa: E402
-from cli.bus_lab import SHORT_RUN, Lab  # noqa: E402
 
 COVERAGE = "coverage==7.17.5"
-BIN = Path(sys.executable).parent
 FAULTS = ("corrupt-torque", "drive-fault-and-recovery", "lose-feedback", "power-loss-and-return", "stuck-torque")
 STORED_LOG = ROOT / "tests" / "reference" / "logs" / "recovery.mcap"
+KNOWN = "certified-known"
 LEFT_OUT = ("adacd_hil/lab/", "adacd_hil/api.py", "adacd_hil/cli/completion.py")
-BY_RUN, BY_WAY = "run", "way"
-"""The context in which Coverage.py counts a line: a reference run or a scenario, and their replays; or a user's way."""
 _MOST_FILES = 25
 
 
@@ -74,7 +68,7 @@ class Played(NamedTuple):
 
 def main() -> int:
     """Play, measure, print."""
-    known = [*reference_runs.names(), *FAULTS, *WAYS]
+    known = [*reference_runs.names(), *FAULTS, *OTHER_WAYS]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", help="reference runs or scenarios; default: all")
     parser.add_argument("--functions", action="store_true", help="name the functions that no run enters")
@@ -87,15 +81,13 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         environment = _environment(folder)
-        trials = [*(arguments.names or known), str(STORED_LOG)]
+        trials = arguments.names or known
         played = list(play_trials(partial(_play_apart, environment=environment), trials, arguments.jobs, _line))
         failed = [each for each in played if each.error]
-        _combine(folder, environment)
-        alone = _report(folder, environment, "--contexts", BY_RUN)
         report = _report(folder, environment)
     if arguments.json:
         arguments.json.write_text(json.dumps(report), encoding="utf-8")
-    print(f"reference runs and faults alone: {_share(alone)}\n\nwith a user's ways: {_share(report)}")
+    print(_share(report))
     _print(report, arguments.functions)
     for each in failed:
         print(f"{each.name}: {each.error}", file=sys.stderr)
@@ -119,39 +111,13 @@ def replay(log: Path, *options: str) -> None:
     host()
 
 
-def run_with_files(folder: Path) -> None:
-    """Tare, then run twice with the tare and the history of the arm, by the commands."""
-    with pytest.MonkeyPatch.context() as patches:
-        lab = Lab(folder, patches)
-        lab.settings_file.write_text('extends = "certified"\n[operator]\nscript = [{at_s = 3.0, request = "finish"}]\n')
-        files = ("--tare", str(lab.tare_file), "--history", str(folder / "arm.toml"))
-        second = ("--out", str(folder / "second"))
-        for result in (lab.tare(), lab.run(*files), lab.run(*files, *second)):
-            if result.exit_code != 0:
-                sys.exit(result.stderr or result.exit_code)
-
-
-def run_on_vcan(folder: Path) -> None:
-    """Run on real SocketCAN, the emulator in a process of its own."""
-    (folder / "short.toml").write_text(SHORT_RUN)
-    on_bus = "run -i socketcan -c vcan0"
-    host = f"{BIN}/adacd-hil {on_bus} --clock lockstep --config {folder}/short.toml --out {folder}/run"
-    both = f"{BIN}/firmware-sim {on_bus} --once --scenario idle & {host}; code=$?; wait; exit $code"
-    subprocess.run([ROOT / "tools" / "with-vcan", "--", "sh", "-c", both], check=True)
-
-
-def look_at_configurations(folder: Path) -> None:
-    """Show, check and explain configurations, a wrong one too."""
-    (folder / "wrong.toml").write_text('extends = "certified"\n[bus]\nperiod_us = 250\n')
-    for words, status in (
-        (("show", "certified", "--changed"), 0),
-        (("check", "certified", "paper"), 0),
-        (("check", str(folder / "wrong.toml")), 2),
-        (("docs", "certified.noise_sigmas"), 0),
-    ):
-        result = called("config", *words)
-        if result.exit_code != status:
-            sys.exit(f"config {' '.join(words)}: exit status {result.exit_code}, not {status}: {result.stderr}")
+def play_by_commands(folder: Path) -> None:
+    """Play the run of a known arm by the commands, on vcan, and replay it."""
+    call = f"play_on_vcan({KNOWN!r}, Path({os.fspath(folder)!r}))"
+    program = f"import sys; from reference_runs import Path, play_on_vcan; sys.exit({call}.status)"
+    command = [ROOT / "tools" / "with-vcan", "--can", "vcan0", "--", sys.executable, "-c", program]
+    subprocess.run(command, check=True)
+    replay(folder / LOG_NAME)
 
 
 def replay_recording(folder: Path) -> None:
@@ -163,40 +129,30 @@ def replay_recording(folder: Path) -> None:
     replay(recording, "--against", str(STORED_LOG))
 
 
-def replay_otherwise(folder: Path) -> None:
-    """Replay a log with settings that its run did not have."""
-    del folder
-    replay(STORED_LOG, "--set", "certified.noise_sigmas=7", "--vary", "detector.isolation_window_s=0.05,0.1")
-
-
-WAYS = {
-    "tare-and-history": run_with_files,
-    "vcan": run_on_vcan,
-    "configurations": look_at_configurations,
-    "recorded-frames": replay_recording,
-    "what-if": replay_otherwise,
+OTHER_WAYS = {
+    f"{KNOWN} on vcan": play_by_commands,
+    "stored log": lambda _: replay(STORED_LOG),
+    "stored log as a recording": replay_recording,
+    "stored log, another setting": lambda _: replay(STORED_LOG, "--set", "certified.noise_sigmas=13"),
 }
-"""What users do besides, by name."""
+"""The references that are no run on the embedded bus, by name."""
 
 
 def _play_apart(name: str, environment: dict[str, str]) -> Played:
-    """Play and replay a run, replay a log, or go one of the ways, in a process that is measured."""
+    """Play and replay a run, or replay a log, in a process that is measured."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = f"Path({scratch!r})"
-        log = f"Path({name!r})" if name.endswith(".mcap") else f"reached_lines.play({name!r}, {folder})"
-        call = f"WAYS[{name!r}]({folder})" if name in WAYS else f"replay({log})"
-        program = f"import reached_lines; from pathlib import Path; reached_lines.{call}"
-        own = {**environment, "REACHED_BY": BY_WAY if name in WAYS else BY_RUN}
+        call = f"OTHER_WAYS[{name!r}]({folder})" if name in OTHER_WAYS else f"replay(play({name!r}, {folder}))"
+        program = f"from reached_lines import *; from pathlib import Path; {call}"
         done = subprocess.run(
-            [sys.executable, "-c", program], env=own, cwd=ROOT, capture_output=True, text=True, check=False
+            [sys.executable, "-c", program], env=environment, cwd=ROOT, capture_output=True, text=True, check=False
         )
     said = done.stderr.strip().splitlines() or [""]
-    return Played(Path(name).stem, f"exit status {done.returncode}: {said[-1]}" if done.returncode else "")
+    return Played(name, f"exit status {done.returncode}: {said[-1]}" if done.returncode else "")
 
 
 def _line(played: Played) -> str:
-    done = "done" if played.name in WAYS else "played, and replayed the same"
-    return f"{played.name} {played.error or done}"
+    return f"{played.name} {played.error or 'replayed the same'}"
 
 
 def _environment(folder: Path) -> dict[str, str]:
@@ -210,7 +166,6 @@ def _environment(folder: Path) -> dict[str, str]:
     (packages / "sitecustomize.py").write_text("import coverage\ncoverage.process_startup()\n", encoding="utf-8")
     settings.write_text(
         f"[run]\nparallel = true\nsource = {ROOT / 'adacd_hil'}\ndata_file = {folder / 'data'}\n"
-        "context = ${REACHED_BY}\n"
         "disable_warnings = no-data-collected,module-not-measured,module-not-imported\n",
         encoding="utf-8",
     )
@@ -223,15 +178,11 @@ def _environment(folder: Path) -> dict[str, str]:
     }
 
 
-def _combine(folder: Path, environment: dict[str, str]) -> None:
-    """Join what the processes have measured."""
-    _coverage(["combine", "--quiet"], folder, environment)
-
-
-def _report(folder: Path, environment: dict[str, str], *options: str) -> dict[str, Any]:
-    """Return Coverage.py's report of what was joined."""
+def _report(folder: Path, environment: dict[str, str]) -> dict[str, Any]:
+    """Join what the processes have measured; return Coverage.py's report of it."""
     report = folder / "report.json"
-    _coverage(["json", "--quiet", "-o", str(report), *options], folder, environment)
+    _coverage(["combine", "--quiet"], folder, environment)
+    _coverage(["json", "--quiet", "-o", str(report)], folder, environment)
     found: dict[str, Any] = json.loads(report.read_text(encoding="utf-8"))
     return found
 
@@ -239,7 +190,7 @@ def _report(folder: Path, environment: dict[str, str], *options: str) -> dict[st
 def _coverage(words: list[str], folder: Path, environment: dict[str, str]) -> None:
     own = {key: value for key, value in environment.items() if key != "COVERAGE_PROCESS_START"}
     command = [sys.executable, "-m", "coverage", *words, f"--rcfile={folder / 'coveragerc'}"]
-    subprocess.run(command, env={**own, "REACHED_BY": BY_RUN}, cwd=ROOT, check=True)
+    subprocess.run(command, env=own, cwd=ROOT, check=True)
 
 
 def is_counted(path: str) -> bool:
