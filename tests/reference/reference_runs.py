@@ -3,8 +3,9 @@
 Each run is two files in `runs/`: NAME.config.toml and NAME.scenario.toml; a run of a known arm has its tare and its
 history beside, NAME.tare.toml and NAME.history.toml. What it came to is stored in NAME.json:
 
-- decisions: every transition with its cycle, every final contact report, the fault, the model at the end. Compared on
-  every machine, within `CYCLES` cycles and `SHARE` of a value.
+- decisions: every transition with its cycle, every final contact report, all that is said of certificates, the fault,
+  the model at the end. Compared on every machine, within `CYCLES` cycles and `SHARE` of a value; a text without its
+  numbers.
 - bits: for each field of /scheme, /control and /contact, and for each identifier on the bus both ways, one digest per
   `BLOCK_CYCLES` cycles. Compared where `arithmetic` is that of the machine on which they were stored: another numpy, or
   a processor without fused multiply-add, may round the last bit differently.
@@ -17,6 +18,7 @@ import hashlib
 import itertools
 import json
 import platform
+import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,7 +41,7 @@ from adacd_hil.control.session import Session
 from adacd_hil.control.tare_file import UsedTare, use_tare
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.log.reader import RunLog, Series, read_log
-from adacd_hil.records import Request, SchemeState
+from adacd_hil.records import CERTIFICATE_EVENTS, Request, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from firmware_sim.cli.own_devices import describe_devices
@@ -53,6 +55,7 @@ SHARE = 0.01
 """Share by which a value may differ there."""
 _ROUNDING = ("avx2", "fma")
 """Instructions that change how numpy's products and the C library's sines round; Zen 3 and 5 gave equal bits."""
+_NUMBER = re.compile(r"\d+\.?\d*")
 _TOPICS = ("/scheme", "/control", "/contact")
 _DIGEST_BYTES = 4
 
@@ -235,6 +238,7 @@ def _decisions(log: RunLog) -> dict[str, Any]:
         "cycles": len(scheme),
         "transitions": transitions,
         "contacts": contacts,
+        "certificates": [each.event.message for each in log.events if each.event.name in CERTIFICATE_EVENTS],
         "theta_hat": [round(value, 7) for value in scheme["theta_hat"][-1].tolist()],
         "threshold": [round(value, 6) if np.isfinite(value) else None for value in scheme["threshold"][-1].tolist()],
     }
@@ -265,10 +269,9 @@ def decision_differences(stored: Reference, now: Reference, cycles: int = 0, sha
 
 
 def _differences(place: str, before: Any, after: Any, cycles: int, share: float) -> list[str]:
-    if isinstance(before, dict) and isinstance(after, dict) and before.keys() == after.keys():
-        return [
-            line for key in before for line in _differences(f"{place}.{key}", before[key], after[key], cycles, share)
-        ]
+    if isinstance(before, dict) and isinstance(after, dict):
+        pairs = {key: (before.get(key), after.get(key)) for key in before | after}
+        return [line for key in pairs for line in _differences(f"{place}.{key}", *pairs[key], cycles, share)]
     if isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
         pairs = enumerate(zip(before, after, strict=True))
         return [line for k, pair in pairs for line in _differences(f"{place}[{k}]", *pair, cycles, share)]
@@ -278,6 +281,8 @@ def _differences(place: str, before: Any, after: Any, cycles: int, share: float)
 
 
 def _is_near(place: str, before: Any, after: Any, cycles: int, share: float) -> bool:
+    if isinstance(before, str) and share:
+        return _NUMBER.sub("", before) == _NUMBER.sub("", after)
     if isinstance(before, float):
         return abs(after - before) <= share * max(abs(before), 0.1)
     is_cycle = place.endswith((".cycle", ".cycles")) or (".transitions" in place and place.endswith("[0]"))
