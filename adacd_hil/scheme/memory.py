@@ -1,6 +1,6 @@
 """Constants and memory of the certified scheme's compiled code, each declared once with its type and shape.
 
-The docstring of a record of memory names the module that writes it, of `Gaps` and `Watch` two; any module may read. In
+The docstring of a record of memory names the module that writes it; any module may read. In
 compiled code, and in functions that describe its results, k is `Constants` and m is `Memory`.
 
 Sizes: n joints; p parameters (dynamic ones, torque offsets, lags, further friction); t terms by place, f = p + n t;
@@ -41,7 +41,7 @@ class Sample:
 
 
 class Gaps:
-    """Sample before the present one, and samples missing since: written by `certified_kernel` and `certified_memory`.
+    """Sample before the present one, and samples missing since: written by `certified_kernel`.
 
     has_gap: the filters resume at the next sample. is_steady: no sample is missing. last, between: q, dq, tau_J of the
     sample before, and of an interpolated one.
@@ -356,7 +356,7 @@ class MissingTorque:
 
 
 class Watch:
-    """Counts that decide when a cycle leaves a task to Python: written by `cycle` and `certified_pipeline`.
+    """Counts that decide when a cycle leaves a task to Python: written by `cycle`.
 
     has_forgotten: FORGET was asked for the present contact. monitored_cycles: since the last SECOND. until_push_cycles:
     until the check for PUSHED, 0 without one.

@@ -534,7 +534,7 @@ def _run(
         if k == 0:
             torque_filter.resume(a, a, Y_p, Y_h, tau_J[k], input_old, tau_old, S, W_f)
         else:
-            torque_filter.advance_torque(hold, tau_old, tau_J[k], tau_f)
+            torque_filter.advance(hold, tau_old, tau_J[k], tau_f)
             torque_filter.advance_regressor(hold, a, a, Y_p, Y_h, input_old, S, W_f)
         tau[:] = tau_f + smoothing * (tau - tau_f)
         W[:] = W_f + smoothing * (W - W_f)

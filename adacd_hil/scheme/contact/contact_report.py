@@ -22,7 +22,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, ContactKind, ContactLevel, ContactReport, Reaction, Vector
 from adacd_hil.scheme.contact import localisation
 from adacd_hil.scheme.contact.contact_kind import classify
-from adacd_hil.scheme.contact.course import CourseMemory
+from adacd_hil.scheme.contact.course import CourseMemory, put_link
 from adacd_hil.scheme.detect.undone_filter import ONSET_FRACTION
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.scheme_settings import KIND_S
@@ -102,7 +102,7 @@ def _report(m: CourseMemory, link: int, direction: tuple[int, int], **evidence: 
 
     evidence: the report's fields that `m` doesn't have.
     """
-    m.link = link
+    put_link(m, link)
     return ContactReport(
         cycle=int(m.detected_cycle),
         link=link,

@@ -105,6 +105,11 @@ def begin(m: CourseMemory) -> None:
     m.level = ContactLevel.CONTACT
 
 
+def put_link(m: CourseMemory, link: int) -> None:
+    """Store the touched link by a report; for another one than before, the next cycle chooses the reaction anew."""
+    m.link = link
+
+
 @compiled
 def goes_on(m: CourseMemory) -> bool:
     """Return whether the arm moves on along its path: the reaction in force is NONE or SLOW_DOWN."""

@@ -21,6 +21,12 @@ ONSET_FRACTION = 0.5
 
 
 @compiled
+def forget(history: Vector) -> None:
+    """Set `history` to zeros: the filter begins anew."""
+    history[:] = 0.0
+
+
+@compiled
 def undo_filter(tau_ext_hat: Vector, decay: float, history: Vector, tau_ext_wide_hat: Vector) -> None:
     """Put tau_ext_hat (2,) first in `history`; fill tau_ext_wide_hat (2,), the mean torque with the filter undone.
 

@@ -35,6 +35,7 @@ from adacd_hil.scheme.memory import Constants, Memory, TermConstants
 from adacd_hil.scheme.model import filter_bank
 from adacd_hil.scheme.model.regressor import F_C1
 from adacd_hil.scheme.model.torque_by_place import PLACE_TERMS
+from adacd_hil.scheme.model.torque_filter import FirstOrderHold, advance, low_pass
 from adacd_hil.settings.configuration import Settings
 
 EXPECTED_NM = 0.06
@@ -86,14 +87,15 @@ def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
     only the pole advances. rates (3,): the filter's coefficients for one period, see `torque_filter.FirstOrderHold`;
     smoothing: share of the pole's old output that stays after one period.
     """
-    decay, weight_old, weight_new = rates[0], rates[1], rates[2]
+    hold = FirstOrderHold(rates[0], rates[1], rates[2])
     X, X_old, X_f, X_learnt = m.regressor.X, m.missing_torque.X_old, m.missing_torque.X_f, m.missing_torque.X_learnt
     for i in range(X.shape[0]):
-        for term in range(PLACE_TERMS):
-            if is_seen:
-                X_f[i, term] = decay * X_f[i, term] + (weight_old * X_old[i, term] + weight_new * X[i, term])
-            X_old[i, term] = X[i, term]
-            X_learnt[i, term] = X_f[i, term] + smoothing * (X_learnt[i, term] - X_f[i, term])
+        if is_seen:
+            advance(hold, X_old[i], X[i], X_f[i])
+        else:
+            for term in range(PLACE_TERMS):
+                X_old[i, term] = X[i, term]
+        low_pass(smoothing, X_f[i], X_learnt[i])
 
 
 @compiled

@@ -79,7 +79,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     m.gaps.has_gap = 1.0
     filter_bank.forget(m)
     missing_torque.forget(m)
-    m.wide_history[:] = 0.0
+    undone_filter.forget(m.wide_history)
     belief.begin_fit(k, m, is_payload)
     if is_payload and int(k.first_offset) > regressor.A5:
         filter_bank.rest(m)

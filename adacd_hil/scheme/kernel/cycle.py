@@ -20,7 +20,7 @@ from adacd_hil.scheme.contact import contact_report, course
 from adacd_hil.scheme.contact.course import CourseConstants, CourseMemory
 from adacd_hil.scheme.kernel import certified_kernel, paper_kernel
 from adacd_hil.scheme.kernel.kernel_samples import put_sample
-from adacd_hil.scheme.memory import Sample
+from adacd_hil.scheme.memory import Memory, Sample
 from adacd_hil.scheme.model import filter_bank
 from adacd_hil.scheme.supervisor import supervisor
 from adacd_hil.scheme.supervisor.findings import CONTACT_SHIFT, WITHHELD
@@ -270,6 +270,11 @@ def end_paper(
     return follow_contact(
         course_constants[0], course_memory[0], samples[place], decisions[place], tau_ext_hat, tau_ext_hat
     )
+
+
+def await_push(m: Memory, cycles: int) -> None:
+    """Let the stopped arm be checked for a push after so many cycles, see PUSHED."""
+    m.watch.until_push_cycles = cycles
 
 
 @compiled

@@ -178,7 +178,7 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
     m.has_gap = 1.0
     m.W_f[:] = 0.0
     out.tau_f[:] = 0.0
-    m.wide_history[:] = 0.0
+    undone_filter.forget(m.wide_history)
     m.mode = LEARN  # used by a step beside; in charge, the mode follows from the state
     m.P[:] = np.diag(c.P0)
     excitation.begin(m.motion)
@@ -266,7 +266,7 @@ def _advance(
     a, b = c.a_rad_s, c.b_rad_s
     regressor.fill_momentum(q, dq, m.Y_p)
     regressor.fill_remainder(q, dq, c.level_rad, m.Y_h)
-    torque_filter.advance_torque(hold, m.tau_old, tau_J, tau_f)
+    torque_filter.advance(hold, m.tau_old, tau_J, tau_f)
     torque_filter.advance_regressor(hold, a, b, m.Y_p, m.Y_h, m.input_old, m.S, m.W_f)
 
 

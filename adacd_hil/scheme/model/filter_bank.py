@@ -26,9 +26,10 @@ from adacd_hil.records import Vector
 from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model.torque_filter import (
     FirstOrderHold,
+    advance,
     advance_regressor,
-    advance_torque,
     first_order_hold,
+    low_pass,
     resume,
 )
 from adacd_hil.settings.configuration import Settings
@@ -137,7 +138,7 @@ def take_sample(k: Constants, m: Memory, tau_J: Vector, is_seen: bool) -> None:
         )
         if is_seen:
             hold = FirstOrderHold(rates[0, c], rates[1, c], rates[2, c])
-            advance_torque(hold, tau_old, tau_J, own.tau_f[c])
+            advance(hold, tau_old, tau_J, own.tau_f[c])
             advance_regressor(hold, a, a, m.regressor.Y_p, m.regressor.Y_h, input_old, S, W_f)
         else:
             resume(a, a, m.regressor.Y_p, m.regressor.Y_h, tau_J, input_old, tau_old, S, W_f)
@@ -172,10 +173,9 @@ def smooth_learnt(smoothing: float, W_f: Vector, tau_f: Vector, W_learnt: Vector
 
     smoothing: share of the old value that stays; 0 passes W_f and tau_f of that filter unchanged.
     """
-    for i in range(tau_learnt.shape[0]):
-        tau_learnt[i] = tau_f[LEARNT, i] + smoothing * (tau_learnt[i] - tau_f[LEARNT, i])
-        for j in range(W_learnt.shape[1]):
-            W_learnt[i, j] = W_f[LEARNT, i, j] + smoothing * (W_learnt[i, j] - W_f[LEARNT, i, j])
+    low_pass(smoothing, tau_f[LEARNT], tau_learnt)
+    for i in range(W_learnt.shape[0]):
+        low_pass(smoothing, W_f[LEARNT, i], W_learnt[i])
 
 
 @compiled
@@ -197,7 +197,7 @@ def smooth(smoothing: float, r: Vector, y: Vector) -> None:
     """
     count = r.shape[0]
     for c in range(count):
+        low_pass(smoothing, r[c], y[c])
         for i in range(r.shape[1]):
-            y[c, i] = r[c, i] + smoothing * (y[c, i] - r[c, i])
             if c > 0:
                 y[count + c - 1, i] = r[c, i]

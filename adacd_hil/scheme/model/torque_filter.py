@@ -54,11 +54,18 @@ def first_order_hold(a_rad_s: float, b_rad_s: float, period_s: float) -> FirstOr
 
 
 @compiled
-def advance_torque(hold: FirstOrderHold, tau_old: Vector, tau_new: Vector, tau_f: Vector) -> None:
-    """Advance tau_f (2,) over one period in place; copy tau_new to tau_old."""
-    for i in range(tau_f.shape[0]):
-        tau_f[i] = hold.decay * tau_f[i] + (hold.weight_old * tau_old[i] + hold.weight_new * tau_new[i])
-        tau_old[i] = tau_new[i]
+def advance(hold: FirstOrderHold, u_old: Vector, u_new: Vector, x: Vector) -> None:
+    """Advance the filtered values x (m,) over one period in place; copy u_new to u_old."""
+    for i in range(x.shape[0]):
+        x[i] = hold.decay * x[i] + (hold.weight_old * u_old[i] + hold.weight_new * u_new[i])
+        u_old[i] = u_new[i]
+
+
+@compiled
+def low_pass(share: float, x: Vector, y: Vector) -> None:
+    """Advance y (m,) over one period in place towards x (m,). share: of the old value that stays; 0 copies x."""
+    for i in range(y.shape[0]):
+        y[i] = x[i] + share * (y[i] - x[i])
 
 
 @compiled

@@ -22,6 +22,7 @@ from adacd_hil.scheme.kernel.cycle import (
     REFUSED,
     SECOND,
     TOOK_OVER,
+    await_push,
     certified_cycle,
     end_certified,
     run_certified,
@@ -181,7 +182,7 @@ class CertifiedPipeline(Pipeline):
             again = self._doubt.describe_again()
             self._add_event(Event("info", "touch", again) if again else None)
             if is_touched and state is SchemeState.STOPPED:
-                self._m.watch.until_push_cycles = self._push_cycles
+                await_push(self._m, self._push_cycles)
         if state is SchemeState.MONITOR:
             self._doubt.go_on(cycle)
         return state
@@ -197,7 +198,7 @@ class CertifiedPipeline(Pipeline):
             self._margin.forget()
             self._warned.clear()
             self._doubt.forget()
-            self._course.is_model_valid = True
+            self._set_valid(True)
             self._feed_forward()
 
     def _begin_adaptation(self, previous: SchemeState) -> None:
@@ -232,7 +233,7 @@ class CertifiedPipeline(Pipeline):
 
         Set the feedforward's model to 0, and mark it as not valid.
         """
-        self._course.is_model_valid = False
+        self._set_valid(False)
         self.theta_ff = np.zeros(self.theta_ff.size)
         self._events.append(self._watch.revoke())
         earlier.forget(self._m)

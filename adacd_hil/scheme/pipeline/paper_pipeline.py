@@ -50,9 +50,9 @@ class PaperPipeline(Pipeline):
         state = self.state
         if previous is SchemeState.ADAPT and state is SchemeState.MONITOR:
             self.theta_ff = self.numbers.block[0].theta_hat.copy()
-            self._course.is_model_valid = is_positive_definite(self.theta_ff)
+            self._set_valid(is_positive_definite(self.theta_ff))
         elif state is SchemeState.ADAPT and previous is not state:
             if self._course.supervisor.cause == SchemeEvent.REVOKED:
                 self.theta_ff = np.zeros(self.theta_ff.size)
-                self._course.is_model_valid = False
+                self._set_valid(False)
             paper_kernel.begin_adaptation(*self.numbers[:3])

@@ -104,6 +104,10 @@ class Pipeline(ABC):
         """The scheme's state after the last cycle."""
         return SchemeState(self._course.supervisor.state)
 
+    def _set_valid(self, is_valid: bool) -> None:
+        """Set whether the model may be fed forward."""
+        self._course.is_model_valid = is_valid
+
     def compile_cycle(self) -> None:
         """Compile each function of the cycle by a call on copies, so that no later cycle compiles."""
         inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self.theta_ff, 0.0)
