@@ -143,8 +143,9 @@ class Rig:
 
     def _follow(self) -> None:
         """Let the queue be acknowledged as a bench that goes by the clock does."""
-        if self._is_wall and self.queue is not None and self.queue.is_acknowledged != self.bench.is_acknowledged:
-            self.queue.is_acknowledged = self.bench.is_acknowledged
+        is_acknowledged = self.bench.injector.plan.is_acknowledged
+        if self._is_wall and self.queue is not None and self.queue.is_acknowledged != is_acknowledged:
+            self.queue.is_acknowledged = is_acknowledged
 
     def start(self) -> None:
         """Bring the nodes into operation, as a host before this one may have done; `sent` begins anew."""

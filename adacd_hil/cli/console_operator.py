@@ -47,10 +47,6 @@ class ConsoleOperator:
         self._thread = threading.Thread(target=self._listen, name="console", daemon=True)
         self._thread.start()
 
-    def join(self, timeout_s: float) -> None:
-        """Wait until the terminal's stream has ended, at most `timeout_s`; return in both cases."""
-        self._thread.join(timeout_s)
-
     def _listen(self) -> None:
         """Queue the request of each known word until the terminal's stream ends; print that a word is unknown."""
         if isinstance(self._stream, io.TextIOWrapper):

@@ -31,7 +31,7 @@ _ON_WHITE: Final = (resources.files("adacd_hil.lab.report") / "assets/report.css
 COLOURS: Final[dict[str, str]] = dict(re.findall(r"--(\w+): (#\w+)", _ON_WHITE))
 """Those of the pages, by their names."""
 _DOTS_PER_INCH: Final = 150
-_ENVELOPE_BINS: Final = 1000
+ENVELOPE_BINS: Final = 1000
 """Two points each: as fine as the widest screen on which the report is read."""
 
 _COLOURED: Final = {
@@ -105,13 +105,13 @@ def write_figures(out_dir: Path, name: str, described: dict[str, Any], drawings:
         return replace_files(out_dir, contents)
 
 
-def envelope(y: Vector, bins: int = _ENVELOPE_BINS) -> NDArray[np.int64]:
-    """Return indices of y (k,), ascending: smallest and largest value of each of at most `bins` parts, and both ends.
+def envelope(y: Vector) -> NDArray[np.int64]:
+    """Return indices of y (k,), ascending: both ends, and the extremes of each of `ENVELOPE_BINS` parts at most.
 
     The parts are equally long, except the last. A series with at most two values per part is returned whole. NaN is
     never smallest or largest.
     """
-    width = -(-len(y) // bins)
+    width = -(-len(y) // ENVELOPE_BINS)
     if width <= 2:
         return np.arange(len(y))
     return np.union1d(extreme_rows([y], np.arange(0, len(y), width)), [0, len(y) - 1])

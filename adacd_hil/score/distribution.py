@@ -42,11 +42,10 @@ _SIDE: Final = int(_code(np.array([_HIGH]))[0]) - _FIRST + 1
 class Distribution:
     """Percentiles of the values added so far, in bounded memory."""
 
-    def __init__(self, exact: int = EXACT) -> None:
+    def __init__(self) -> None:
         self.count = 0
-        self._exact = exact
         self._kept: list[NDArray[np.float64]] = []
-        self._bins: NDArray[np.int64] | None = None  # of -_SIDE to _SIDE, once there are more than `exact` values
+        self._bins: NDArray[np.int64] | None = None  # of -_SIDE to _SIDE, once there are more than EXACT values
         self._range = (np.inf, -np.inf)
 
     def add_values(self, values: Values) -> None:
@@ -64,7 +63,7 @@ class Distribution:
             self._sort_in(new)
             return
         self._kept.append(new)
-        if self.count > self._exact:
+        if self.count > EXACT:
             kept, self._kept = self._kept, []
             for part in kept:
                 self._sort_in(part)
@@ -83,7 +82,7 @@ class Distribution:
     def percentiles(self) -> dict[str, float]:
         """Return PERCENTILES by PERCENTILE_NAMES; {} without a value.
 
-        Up to `exact` values each is one that occurred. Of more, all but the smallest and the largest value are the ends
+        Up to `EXACT` values each is one that occurred. Of more, all but the smallest and the largest value are the ends
         of their bins that are nearer to 0.
         """
         return dict(zip(PERCENTILE_NAMES, map(self._at, self._ranks()), strict=False))
@@ -91,7 +90,7 @@ class Distribution:
     def low_percentiles(self) -> dict[str, float]:
         """Return the mirrored PERCENTILES by LOW_PERCENTILE_NAMES, for values that mustn't be small; {} without any.
 
-        Up to `exact` values each is one that occurred. Of more, all but the smallest and the largest value are the ends
+        Up to `EXACT` values each is one that occurred. Of more, all but the smallest and the largest value are the ends
         of their bins that are nearer to 0.
         """
         mirrored = (self.count - 1 - rank for rank in self._ranks())
@@ -100,7 +99,7 @@ class Distribution:
     def median(self) -> float:
         """Return the median, of an even number the mean of the middle two.
 
-        Beyond `exact` values each of these is the end of its bin that is nearer to 0. NaN without a value.
+        Beyond `EXACT` values each of these is the end of its bin that is nearer to 0. NaN without a value.
         """
         if self.count == 0:
             return float("nan")

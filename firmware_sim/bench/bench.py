@@ -98,11 +98,6 @@ class Bench:
         return self._outbox.is_paced
 
     @property
-    def is_acknowledged(self) -> bool:
-        """Whether some device has power and is on the bus, so that it acknowledges frames of the host."""
-        return self._plan.is_acknowledged
-
-    @property
     def is_operational(self) -> bool:
         """Whether all nodes are in NMT state Operational."""
         return all(device.is_operational for device in self.devices)

@@ -50,11 +50,9 @@ _RESPONSE_DOWNLOAD = 0x60
 
 
 class Abort(IntEnum):
-    """SDO abort codes, CiA 301 table 22."""
+    """SDO abort codes that the devices choose, of CiA 301 table 22."""
 
-    TOGGLE = 0x05030000
     UNKNOWN_COMMAND = 0x05040001
-    WRITE_ONLY = 0x06010001
     READ_ONLY = 0x06010002
     NO_OBJECT = 0x06020000
     NOT_MAPPABLE = 0x06040041

@@ -160,12 +160,12 @@ def test_fast_noise_is_the_velocitys_and_what_lasts_is_the_models():
 
 def test_the_largest_ratio_of_an_hour_is_what_the_margin_says():
     generator = np.random.default_rng(11)
-    watch = MarginWatch(1, memory_blocks=1000.0)
-    blocks = generator.gumbel(0.2, 0.02, (3600 * 20, 1))
+    watch = MarginWatch()
+    blocks = generator.gumbel(0.2, 0.02, (3600 * 20, 2))
     for block in blocks[:3000]:
         watch.add_block(block)
-    hourly = np.median(blocks.reshape(20, 3600).max(axis=1))
-    np.testing.assert_allclose(1.0 / watch.margin[0], hourly, rtol=0.1)
+    hourly = np.median(blocks.reshape(20, 3600, 2).max(axis=1), axis=0)
+    np.testing.assert_allclose(1.0 / watch.margin, hourly, rtol=0.1)
 
 
 @pytest.mark.parametrize("burst_s", [3.0, 6.0, 12.0])

@@ -11,7 +11,7 @@ from hand_made_run import evaluated, make_certified_run, make_run, react, record
 
 from adacd_hil.lab.logs.cut import cut
 from adacd_hil.lab.report import run_reading
-from adacd_hil.lab.report.page import left_out_text, shown_contacts, stretch_text
+from adacd_hil.lab.report.page import CONTACTS, left_out_text, shown_contacts, stretch_text
 from adacd_hil.lab.report.report_files import write_run_report
 from adacd_hil.lab.report.report_json import report_json
 from adacd_hil.lab.report.run_reading import TruthClock, read_run
@@ -306,14 +306,14 @@ def test_the_report_of_a_stretch_says_which_it_is(certified, tmp_path):
 def test_of_many_contacts_the_first_are_listed_and_those_that_went_wrong(certified):
     metrics = evaluated(read_run(certified, truth_of(certified)).run)
     right = next(contact for contact in metrics.contacts if contact.direction_ok)
-    many = tuple(replace(right, number=number) for number in range(1, 51))
-    wrong = replace(right, number=51, link=2, link_detected=1, link_ok=False)
+    many = tuple(replace(right, number=number) for number in range(1, CONTACTS + 2))
+    wrong = replace(right, number=CONTACTS + 2, link=2, link_detected=1, link_ok=False)
     metrics = replace(metrics, contacts=(*many, wrong), evidence=None)
-    assert [contact.number for contact in shown_contacts(metrics, 5)] == [1, 2, 3, 4, 5, 51]
-    assert left_out_text(metrics, 5) == (
-        "The first 5 and 1 more that went wrong of 51 contacts; all are in contacts.csv."
+    assert [contact.number for contact in shown_contacts(metrics)] == [*range(1, CONTACTS + 1), CONTACTS + 2]
+    assert left_out_text(metrics) == (
+        "The first 200 and 1 more that went wrong of 202 contacts; all are in contacts.csv."
     )
-    assert left_out_text(metrics, 51) == ""
+    assert left_out_text(replace(metrics, contacts=many[:CONTACTS])) == ""
 
 
 def test_many_adaptations_are_summed_up():

@@ -22,7 +22,7 @@ def columns(**values: list[int]) -> CycleColumns:
 
 
 def evidence_of(**values: list[int]):
-    return collect_evidence(columns(**values), 1000, is_modelled=False)
+    return collect_evidence(columns(**values), 1000)
 
 
 def test_a_cycle_without_complete_feedback_has_no_time_of_it():

@@ -47,6 +47,12 @@ def test_without_a_time_no_stop_is_acknowledged() -> None:
     assert {operator.request(float(t), SchemeState.STOPPED) for t in range(100)} == {Request.NONE}
 
 
+def wait_for_end(operator: ConsoleOperator) -> None:
+    """Wait until the terminal's stream has ended and all its words are queued."""
+    operator._thread.join(HANG_S)
+    assert not operator._thread.is_alive()
+
+
 @pytest.mark.parametrize(
     ("word", "request_"),
     [
@@ -59,14 +65,14 @@ def test_without_a_time_no_stop_is_acknowledged() -> None:
 )
 def test_the_console_takes_a_word_a_line(word: str, request_: Request) -> None:
     operator = ConsoleOperator(script(), io.StringIO(f"{word}\n"))
-    operator.join(1.0)
+    wait_for_end(operator)
     assert operator.request(1.0, SchemeState.STOPPED) is request_
 
 
 def told(typed_words: str, *states: SchemeState) -> list[str]:
     lines: list[str] = []
     operator = ConsoleOperator(script(), io.StringIO(typed_words), lines.append)
-    operator.join(1.0)
+    wait_for_end(operator)
     for state in states:
         operator.request(1.0, state)
     return lines
@@ -126,7 +132,7 @@ def answers(before: bytes, after: bytes, *states: SchemeState) -> list[FaultAnsw
         first = operator.answer_fault(1000.0)  # however long it takes
         keys.write(after)
         keys.close()
-        operator.join(1.0)
+        wait_for_end(operator)
         return [first, operator.answer_fault(0.5), operator.answer_fault(0.0)]
 
 
@@ -156,7 +162,7 @@ def test_a_fault_is_answered_by_what_is_typed_after_it(
 
 def typed(data: bytes) -> ConsoleOperator:
     operator = ConsoleOperator(script(), io.TextIOWrapper(io.BytesIO(data), encoding="utf-8"))
-    operator.join(1.0)
+    wait_for_end(operator)
     return operator
 
 
@@ -172,6 +178,6 @@ def test_a_terminal_that_hangs_up_ends_the_console_in_silence(monkeypatch: pytes
     with os.fdopen(ours, encoding="utf-8") as stream:
         operator = ConsoleOperator(script(), stream)
         os.close(theirs)  # reading its other end raises EIO, as a terminal does to who is in the background
-        operator.join(1.0)
+        wait_for_end(operator)
     assert operator.answer_fault(0.0) is FaultAnswer.END
     assert failures == []

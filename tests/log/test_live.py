@@ -150,7 +150,7 @@ def flood(fed):
         fed.event(number, Event("info", "flood", 4000 * "x"))
         if number % 500 == 0 or number == FLOOD - 1:
             fed.write()
-            while fed.live is not None and fed.live.waiting_bytes:  # what finds no room isn't shown at all
+            while fed.live is not None and fed.live._ring.waiting:  # what finds no room isn't shown at all
                 os.sched_yield()
     fed.event(FLOOD, LAST)
     fed.write()

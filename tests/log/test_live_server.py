@@ -20,8 +20,9 @@ from recorded_run import CODEC, feed, make_run, start
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from adacd_hil.lab.live import admission as admission_module
 from adacd_hil.lab.live import server as server_module
-from adacd_hil.lab.live.admission import FULL, NOTICES, Admission
+from adacd_hil.lab.live.admission import FULL, Admission, ViewerRefusal
 from adacd_hil.lab.live.feed import ServerSetup
 from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.lab.live.server import LiveServer, listen, url_of
@@ -384,7 +385,8 @@ def test_nothing_that_a_peer_sends_reaches_the_runs_terminal():
     lines = complaints.decode().splitlines()
     assert run.returncode == 0
     assert out == b""
-    assert set(lines) <= set(NOTICES)
+    notices = {each.notice for each in vars(admission_module).values() if isinstance(each, ViewerRefusal)}
+    assert set(lines) <= notices
     assert len(lines) == len(set(lines)) == 3  # of origin, name and protocol, once each
 
 

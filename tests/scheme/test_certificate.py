@@ -29,7 +29,7 @@ def fitted_arm(**changes):
 
 
 def missing(m):
-    return termination.describe_missing(K, m, NAMES, PARAMETER_UNITS)
+    return termination.describe_missing(K, m, NAMES)
 
 
 def uncertain(name, times):

@@ -62,7 +62,7 @@ def case():
 
 
 def test_an_arm_of_which_nothing_is_known_raises_no_alarm_in_free_motion(case):
-    detected = offline.detect(case.columns, case.unseen, case.before, SETTINGS)
+    detected = offline.detect(case.columns, case.unseen, case.before, SETTINGS, np.zeros(7))
     assert detected.contacts == ()
 
 
@@ -90,7 +90,7 @@ def test_noise_of_the_velocity_is_no_contact_and_raises_the_threshold_by_the_mas
     assert offline.certify(case.columns, [unseen], estimate, settings).margin > 1.0
     still = Record(unseen.q[:1], np.zeros((1, 7)), unseen.tau_J[:1])
     M = mass_matrix(case.arm.chain, unseen.q[0], case.arm.theta_full)
-    threshold = offline.detect(case.columns, still, estimate, settings).threshold[0]
+    threshold = offline.detect(case.columns, still, estimate, settings, np.zeros(7)).threshold[0]
     expected = 6.0 * np.hypot(FILTERED_NOISE_NM, 0.05 * np.linalg.norm(M, axis=1))
     np.testing.assert_allclose(threshold, expected, rtol=0.05, atol=0.01)
 

@@ -11,6 +11,7 @@ from smooth_motion import smooth_motion, torque_of
 
 from adacd_hil.lab.detectors.detector_registry import OWN_CHANNELS, detectors, register
 from adacd_hil.lab.detectors.detectors import (
+    FLOOR_NM,
     VELOCITY_LAG_S,
     autocovariance,
     constants_of,
@@ -96,9 +97,10 @@ def test_friction_that_holds_a_joint_still_is_no_torque():
 
 
 def test_white_noise_makes_the_average_the_best_window_and_a_sigma_of_one():
-    (weights,) = likelihood_windows(np.r_[0.04, np.zeros(31)], (8,), 0.0, T, floor_Nm=0.0)
-    np.testing.assert_allclose(weights[:8], 1.0 / (0.2 * math.sqrt(8.0)), rtol=1e-12)
-    assert np.all(weights[8:] == 0.0)
+    sigma_Nm = 1e6 * FLOOR_NM  # beside which the floor is nothing
+    (weights,) = likelihood_windows(np.r_[sigma_Nm**2, np.zeros(31)], (8,), 0.0, T)
+    average = 1.0 / (sigma_Nm * math.sqrt(8.0))
+    np.testing.assert_allclose(weights, average * np.r_[np.ones(8), np.zeros(24)], rtol=1e-9, atol=1e-9 * average)
 
 
 def test_a_whitened_window_has_a_sigma_of_one_on_coloured_noise():

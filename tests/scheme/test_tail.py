@@ -192,8 +192,8 @@ def test_what_of_a_touch_was_seen_before_it_was_flagged_raises_no_threshold():
 
 
 def test_a_margin_that_shrinks_is_named_against_what_it_was_once_the_watch_had_settled():
-    watch = margin_watch.MarginWatch(2, memory_blocks=5.0)
-    for _ in range(10):
+    watch = margin_watch.MarginWatch()
+    for _ in range(margin_watch.MEMORY_BLOCKS + 1):
         watch.add_block(np.array([0.4, 0.4]))
         assert watch.warning == ""
     watch.add_block(np.array([np.inf, 0.4]))  # not finite: ignored

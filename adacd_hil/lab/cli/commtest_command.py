@@ -231,7 +231,7 @@ def describe(test: CommunicationTest, settings: Settings, scheduler: str) -> dic
 
 
 def _evidence(test: CommunicationTest, period_us: float) -> TimingEvidence:
-    return collect_evidence(test.columns, period_us, is_modelled=False)
+    return collect_evidence(test.columns, period_us)
 
 
 def _warnings(test: CommunicationTest, scheduler: str) -> list[str]:

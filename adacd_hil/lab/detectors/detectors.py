@@ -63,21 +63,21 @@ BAND_RAD_S: Final = (10.0, 100.0)
 """Lower and upper cut-off of the band-pass."""
 DRIFT_NM: Final = 0.02
 """Smoothed torque that cusum ignores."""
+FLOOR_NM: Final = 2e-3
+"""Slow errors of the model, a constant of unknown size; without them a likelihood window would trust averages longer
+than any model deserves."""
 STANDSTILL_RAD_S: Final = 2e-3
 """A slower joint stands still; five times the velocity's noise."""
 
 
-def likelihood_windows(
-    autocovariance: Vector, onset_samples: tuple[int, ...], lag_s: float, period_s: float, floor_Nm: float = 2e-3
-) -> Vector:
+def likelihood_windows(autocovariance: Vector, onset_samples: tuple[int, ...], lag_s: float, period_s: float) -> Vector:
     """Return one joint's likelihood weights (N, L), the newest sample's first, from the covariance (L,) of its z.
 
-    N: number of `onset_samples`, the ages of the steps. With the covariance R of the last L samples, floor_Nm included,
+    N: number of `onset_samples`, the ages of the steps. With the covariance R of the last L samples, FLOOR_NM included,
     and the step's shape s, w = R^-1 s / sqrt(s' R^-1 s): noise of the covariance R comes out with a standard deviation
     of 1, and no other window gives the step more. The shape is the response of a critically damped loop to a step.
-    lag_s: of that loop. floor_Nm: slow errors of the model, added as a constant of unknown size; without them a window
-    would trust averages longer than any model deserves. Raises ValueError unless L is at least the largest age and the
-    variance, the covariance's first element, is positive.
+    lag_s: of that loop. Raises ValueError unless L is at least the largest age and the variance, the covariance's first
+    element, is positive.
     """
     length = autocovariance.shape[0]
     if length < max(onset_samples):
@@ -88,7 +88,7 @@ def likelihood_windows(
     for row, age in enumerate(onset_samples):
         since = 2.0 * period_s * (age - np.arange(length)) / max(lag_s, 1e-9)
         shape = np.where(since > 0.0, 1.0 - (1.0 + since) * np.exp(-np.maximum(since, 0.0)), 0.0)
-        column = autocovariance + floor_Nm**2
+        column = autocovariance + FLOOR_NM**2
         whitened = solve_toeplitz(column, shape)
         weights[row] = whitened / math.sqrt(float(whitened @ shape))
     return weights

@@ -60,7 +60,6 @@ FULL = ViewerRefusal(
     "as many viewers as --live-viewers allows are watching",
     "live view: a viewer was refused, there are as many as --live-viewers allows",
 )
-NOTICES = tuple(refusal.notice for refusal in (_ORIGIN, _HOST, _PROTOCOL, FULL))
 
 
 def normal_origin(origin: str) -> str:

@@ -157,11 +157,6 @@ class LiveFeed:
             self._is_watched = False  # the view's process has closed its socket
         return self._is_watched
 
-    @property
-    def waiting_bytes(self) -> int:
-        """Bytes that the view's process has not taken yet."""
-        return self._ring.waiting
-
     def show(self, messages: Sequence[LoggedMessage]) -> None:
         """Hand consecutive messages to the view's process, without waiting; without a subscription, do nothing.
 

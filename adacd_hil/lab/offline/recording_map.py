@@ -134,13 +134,13 @@ def units_by_slope(units: UnitsSection, factor: float) -> list[tuple[str, str]]:
     Each is (key, unit), those of dq before those of q; empty if none does. factor: velocities over slope with the
     present units.
     """
-    found = [("dq", unit) for unit, value in _SPEED.items() if _is_near(factor * value / _SPEED[units.dq], 1.0)]
-    found += [("q", unit) for unit, value in ANGLE_RAD.items() if _is_near(factor * ANGLE_RAD[units.q] / value, 1.0)]
+    found = [("dq", unit) for unit, value in _SPEED.items() if _is_near_one(factor * value / _SPEED[units.dq])]
+    found += [("q", unit) for unit, value in ANGLE_RAD.items() if _is_near_one(factor * ANGLE_RAD[units.q] / value)]
     return [(key, unit) for key, unit in found if getattr(units, key) != unit]
 
 
-def _is_near(value: float, wanted: float) -> bool:
-    return abs(value / wanted - 1.0) < 0.1
+def _is_near_one(value: float) -> bool:
+    return abs(value - 1.0) < 0.1
 
 
 @dataclass(frozen=True)

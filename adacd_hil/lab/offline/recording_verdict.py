@@ -299,7 +299,7 @@ def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFi
     ):
         if chosen:
             names = joined_names([joints[i].name for i in chosen], len(joints))
-            remedy = f"check the sensor of {names}, and {_column(fit.described, 'tau_J', chosen)}"
+            remedy = f"check the sensor of {names}, and {_torque_columns(fit.described, chosen)}"
             yield RecordingFinding(text.format(names=names), remedy)
     weak = [
         joint.name
@@ -540,8 +540,8 @@ def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[Recordin
         )
 
 
-def _column(described: RecordingMap, key: str, joints: Sequence[int]) -> str:
-    """Return "`columns.KEY`" with the columns of these joints in parentheses, if the map names them."""
-    columns = getattr(described.columns, key)
+def _torque_columns(described: RecordingMap, joints: Sequence[int]) -> str:
+    """Return "`columns.tau_J`" with the columns of these joints in parentheses, if the map names them."""
+    columns = described.columns.tau_J
     named = f" ({', '.join(columns[i] for i in joints)})" if columns else ""
-    return f"`columns.{key}`{named}"
+    return f"`columns.tau_J`{named}"

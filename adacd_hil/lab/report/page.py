@@ -151,10 +151,10 @@ def _asset(name: str) -> dict[str, str]:
     return {"text": text, "digest": b64encode(hashlib.sha256(text.encode()).digest()).decode()}
 
 
-def shown_contacts(metrics: Metrics, most: int) -> tuple[ReportedContact, ...]:
-    """Return the contacts to be listed: the first `most`, and of the later ones that went wrong the first `most`."""
-    later = [contact for contact in metrics.contacts[most:] if went_wrong(contact)]
-    return (*metrics.contacts[:most], *later[:most])
+def shown_contacts(metrics: Metrics) -> tuple[ReportedContact, ...]:
+    """Return the contacts to be listed: the first CONTACTS, and of the later ones that went wrong as many at most."""
+    later = [contact for contact in metrics.contacts[CONTACTS:] if went_wrong(contact)]
+    return (*metrics.contacts[:CONTACTS], *later[:CONTACTS])
 
 
 def went_wrong(contact: ReportedContact) -> bool:
@@ -163,13 +163,13 @@ def went_wrong(contact: ReportedContact) -> bool:
     return is_missed or contact.link_ok is False or contact.direction_ok is False
 
 
-def left_out_text(metrics: Metrics, most: int) -> str:
+def left_out_text(metrics: Metrics) -> str:
     """Return a sentence on which of all contacts `shown_contacts` lists; "" if it lists all."""
-    count, shown = len(metrics.contacts), len(shown_contacts(metrics, most))
+    count, shown = len(metrics.contacts), len(shown_contacts(metrics))
     if shown == count:
         return ""
-    wrong = f" and {shown - most} more that went wrong" if shown > most else ""
-    return f"The first {most}{wrong} of {count} contacts; all are in contacts.csv."
+    wrong = f" and {shown - CONTACTS} more that went wrong" if shown > CONTACTS else ""
+    return f"The first {CONTACTS}{wrong} of {count} contacts; all are in contacts.csv."
 
 
 def has_paper(metrics: Metrics) -> bool:

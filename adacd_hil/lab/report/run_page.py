@@ -7,7 +7,6 @@ import numpy as np
 
 from adacd_hil.lab.report.next_steps import next_steps, origin_words
 from adacd_hil.lab.report.page import (
-    CONTACTS,
     TRACED_CONTACTS,
     Cell,
     Table,
@@ -43,9 +42,9 @@ from adacd_hil.lab.report.timeline import (
 from adacd_hil.lab.score.margins import SETTLING_TIME_CONSTANTS
 from adacd_hil.lab.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.lab.score.report_wording import (
+    centimetres,
     number_text,
     pair_text,
-    scaled,
     signs_text,
     state_words,
     uncertain_text,
@@ -164,7 +163,7 @@ def contacts_table(metrics: Metrics) -> Table | None:
     beside = shown_beside(metrics)
     theirs = {} if beside is None else {each.number: each for each in beside.contacts}
     rows: list[list[object]] = []
-    for contact in shown_contacts(metrics, CONTACTS):
+    for contact in shown_contacts(metrics):
         is_found = contact.detected_s is not None
         delay = number_text(contact.delay_ms, 0) if is_found else why_not_found(contact.is_armed)
         link = number_text(contact.link_detected, 0)
@@ -240,7 +239,7 @@ def _kind(contact: ReportedContact) -> str:
 
 def _found(contact: ReportedContact) -> list[tuple[str, str]]:
     """Return six pairs of name and text on a contact that was found; NONE as text for a missing value."""
-    lever = uncertain_text(scaled(contact.lever_m, 100.0), scaled(contact.lever_sigma_m, 100.0), 1, "cm")
+    lever = uncertain_text(centimetres(contact.lever_m), centimetres(contact.lever_sigma_m), 1, "cm")
     return [
         ("found after", number_text(contact.delay_ms, 0, "ms")),
         ("pushes joints 1 / 2 to", signs_text(contact.direction)),
@@ -343,7 +342,7 @@ def report_page(metrics: Metrics, run: Run, source: ReportSource) -> str:
         push=push_table(metrics.evidence),
         counted=counted_sentence(metrics),
         contacts=contacts_table(metrics),
-        left_out=left_out_text(metrics, CONTACTS),
+        left_out=left_out_text(metrics),
         cards=contact_cards(metrics, run),
         parameters=parameters_table(metrics, run),
         further=further_table(metrics.evidence),

@@ -371,12 +371,9 @@ class TimingGatherer:
         return Count(total, total * PER_CYCLES / self._cycles if self._cycles else None)
 
 
-def collect_evidence(columns: CycleColumns, period_us: float, is_modelled: bool) -> TimingEvidence:
-    """Return the statistics of the times in the columns of a log without states: reactions are left out.
-
-    is_modelled: the log is of lockstep.
-    """
-    gatherer = TimingGatherer(period_us, is_modelled)
+def collect_evidence(columns: CycleColumns, period_us: float) -> TimingEvidence:
+    """Return the statistics of the measured times in the columns of a log without states: reactions are left out."""
+    gatherer = TimingGatherer(period_us, is_modelled=False)
     gatherer.add_columns(columns)
     return gatherer.evidence()
 

@@ -76,9 +76,9 @@ def signed_text(value: float) -> str:
     return f"{value:+.1f}".replace("-", "−")
 
 
-def scaled(value: float | None, factor: float) -> float | None:
-    """Return factor * value; None for None."""
-    return None if value is None else factor * value
+def centimetres(value_m: float | None) -> float | None:
+    """Return a length in cm; None for None."""
+    return None if value_m is None else 100.0 * value_m
 
 
 def uncertain_text(value: float | None, sigma: float | None, digits: int, unit: str) -> str:

@@ -338,15 +338,15 @@ def detect(
     record: Record,
     estimate: ModelEstimate,
     settings: OfflineSettings,
-    lack_Nm: Vector | None = None,
+    lack_Nm: Vector,
 ) -> OfflineDetection:
     """Return external torque, thresholds and contacts of a record, behind the filter of detection.
 
-    lack_Nm (n,): the `lack_Nm` of the model's certificate, which widens the thresholds; None: zero. Raises ValueError
-    if record or `noise_Nm` and model differ in their number of joints.
+    lack_Nm (n,): the `lack_Nm` of the model's certificate, which widens the thresholds. Raises ValueError if
+    record or `noise_Nm` and model differ in their number of joints.
     """
     trace = _trace(model, record, estimate, settings)
-    threshold = _threshold(trace, settings, np.zeros(model.joints) if lack_Nm is None else lack_Nm)
+    threshold = _threshold(trace, settings, lack_Nm)
     window = round(settings.isolation_s / settings.period_s)
     return OfflineDetection(trace.tau_ext_hat, threshold, find_contacts(trace.tau_ext_hat, threshold, window))
 

@@ -8,10 +8,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.records import Vector
+from adacd_hil.records import JOINTS, Vector
 
 HORIZON_BLOCKS = 3600.0
 """Blocks over which the largest peak is expected: of 1 s each, an hour."""
+MEMORY_BLOCKS = 300
+"""Memory of the mean and the deviation, and number of blocks after which the reference is set."""
 WARN_SHARE = 0.75
 """Part of the reference below which a margin is reported."""
 
@@ -24,31 +26,26 @@ class MarginWatch:
     follow the last blocks; bounded tails stay below it.
     """
 
-    def __init__(self, joints: int, memory_blocks: float = 300.0) -> None:
-        """Begin without blocks and without a reference.
-
-        memory_blocks: memory of the mean and the deviation, and number of blocks after which the reference is set.
-        """
-        self._forget = 1.0 / memory_blocks
-        self._mean = np.zeros(joints)
-        self._square = np.zeros(joints)
+    def __init__(self) -> None:
+        """Begin without blocks and without a reference."""
+        self._mean = np.zeros(JOINTS)
+        self._square = np.zeros(JOINTS)
         self._blocks = 0
-        self._settled = round(memory_blocks)
         self.reference: Vector | None = None
         """Margin per joint (n,) when the watch had settled; None until then."""
 
     def add_block(self, ratio: Vector) -> None:
         """Add each joint's largest ratio (n,) of statistic to threshold in a contact-free block.
 
-        Ignore the block if a ratio is NaN or inf. Set `reference` at block number `memory_blocks`.
+        Ignore the block if a ratio is NaN or inf. Set `reference` at block number `MEMORY_BLOCKS`.
         """
         if not np.isfinite(ratio).all():
             return
         self._blocks += 1
-        share = max(self._forget, 1.0 / self._blocks)
+        share = 1.0 / min(self._blocks, MEMORY_BLOCKS)
         self._mean += share * (ratio - self._mean)
         self._square += share * (ratio * ratio - self._square)
-        if self._blocks == self._settled:
+        if self._blocks == MEMORY_BLOCKS:
             self.reference = self.margin
 
     def forget(self) -> None:

@@ -23,7 +23,7 @@ Then the model is frozen, friction coefficients below zero put to zero, and test
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import JOINTS, PARAMETER_UNITS, Vector
 from adacd_hil.scheme.identify.excitation import begin, begin_speeds, eigenvalue_range, gather, has_moved, widen
 from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model.regressor import is_positive_definite
@@ -118,11 +118,11 @@ def test_limit_Nm(k: Constants, square: float) -> float:
     return float(min(k.beta_Nm, TEST_NM + TEST_SHARE * k.residual_Nm * np.sqrt(square)))
 
 
-def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dict[str, str]) -> list[str]:
+def describe_missing(k: Constants, m: Memory, names: tuple[str, ...]) -> list[str]:
     """Return a line for each unmet condition of `is_complete`, with the motion that fulfils it.
 
     The line on too few samples names no motion. [] if the fit is complete. names: of the parameters, in the belief's
-    order. units: by parameter's name.
+    order.
     """
     own = m.motion
     lines = []
@@ -157,7 +157,7 @@ def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dic
     for j, name in enumerate(names):
         std, enough = np.sqrt(m.models.P_belief[j, j]), k.enough_std[j]
         if not std <= enough:
-            unit = units.get(name, "")
+            unit = PARAMETER_UNITS.get(name, "")
             lines.append(f"{name} is known to {std:.3g} {unit}, {enough:.3g} needed: {_motion_for(name)}")
     return lines
 

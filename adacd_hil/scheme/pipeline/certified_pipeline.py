@@ -6,7 +6,7 @@ its would-be alarms are in the block.
 
 import numpy as np
 
-from adacd_hil.records import JOINTS, PARAMETER_UNITS, ContactReport, Event, SchemeState
+from adacd_hil.records import JOINTS, ContactReport, Event, SchemeState
 from adacd_hil.scheme.contact import course
 from adacd_hil.scheme.contact.contact_report import compile_recalled, new_rows, recalled_report
 from adacd_hil.scheme.detect import sensitivity, sight
@@ -56,7 +56,7 @@ class CertifiedPipeline(Pipeline):
         self._cycle_arrays = *self.numbers, *self._paper, *shared
         self._end_arrays = *self.numbers[:3], *shared
         self._is_payload = False
-        self._margin = MarginWatch(JOINTS)
+        self._margin = MarginWatch()
         self._push_cycles = round(FORGOTTEN_S / settings.bus.period_s)
         self._warned: set[str] = set()
         self._events: list[Event] = []
@@ -90,7 +90,7 @@ class CertifiedPipeline(Pipeline):
 
     def describe_missing(self) -> list[str]:
         """Return the lines of a present refusal, and a line for each condition that the fit misses; [] without any."""
-        return [*self._watch.describe(), *termination.describe_missing(self._k, self._m, self._names, PARAMETER_UNITS)]
+        return [*self._watch.describe(), *termination.describe_missing(self._k, self._m, self._names)]
 
     def describe_withheld(self) -> list[str]:
         """Return the lines of a present refusal, see `CertificateWatch.describe`; [] without a refusal."""
@@ -132,7 +132,7 @@ class CertifiedPipeline(Pipeline):
     def _report(self, cycle: int) -> ContactReport:
         return recalled_report(self._settings, self._course.contact, self._rows, cycle)
 
-    def _attend(self, asked: int, cycle: int) -> None:  # noqa: ARG002
+    def _attend(self, asked: int) -> None:
         """Run the tasks in `asked`, bits of `kernel.cycle`, at a cycle's end.
 
         FORGET: learn anew without the samples of a touch. SECOND: judge the margin. PUSHED: report a push on the arm at

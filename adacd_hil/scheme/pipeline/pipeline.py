@@ -135,7 +135,7 @@ class Pipeline(ABC):
     def _report(self, cycle: int) -> ContactReport:
         """Return the report of the present contact, due in this cycle."""
 
-    def _attend(self, asked: int, cycle: int) -> None:
+    def _attend(self, asked: int) -> None:
         """Run a scheme's tasks in `asked`, bits of `kernel.cycle`, at the end of a cycle; none by default."""
 
     def describe_missing(self) -> list[str]:
@@ -222,5 +222,5 @@ class Pipeline(ABC):
             self._follow(asked, previous, cycle, int(observation))
             asked = self._end(samples, decisions, place, *self._end_arrays)
         report = self._report(cycle) if asked & REPORT else None
-        self._attend(asked, cycle)
+        self._attend(asked)
         return report
