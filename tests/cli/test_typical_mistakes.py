@@ -76,6 +76,8 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("runs . --since yesterday", USAGE, ("'yesterday' is no date such as 2026-11-25",)),
     # -- the bus
     ("run -i sockecan -c can0", BUS_MISSING, ("unknown interface 'sockecan'", "did you mean 'socketcan'?")),
+    ("run -i socketcan -c ''", USAGE, ("Invalid value for '-c' / '--channel': the name is empty", "run --help")),
+    ("run -i socketcan -c cann0 --config demo", BUS_MISSING, ("CAN interface cann0 does not exist",)),
     ("scan -i socketcan -c cann0", BUS_MISSING, ("CAN interface cann0 does not exist", "did you mean 'can0'?")),
     ("run -i socketcan -c can0 --without-anchor", BUS_MISSING, ("CAN interface can0 is down", "ip link set can0 up")),
     ("run -i slcan -c tty1 --clock lockstep", USAGE, ("lockstep is for emulated arms", "it needs --clock realtime")),
