@@ -190,6 +190,7 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[Recordin
     for joint in (joint for joint in range(n) if joint not in constant):
         torque, name = columns.tau_J[:, joint], column_name(described, "tau_J", joint)
         run = _stuck_run(torque, columns.q, columns.period_s)
+        stuck_Nm = None if run is None else round(float(torque[run[0]]), 9)
         if run is not None:
             seconds, start_s = (run[1] - run[0]) * columns.period_s, columns.time_s[run[0]]
             yield RecordingFinding(
@@ -197,7 +198,7 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[Recordin
                 "while the arm moves",
                 "leave that time out with --from and --until, and check the sensor",
             )
-        if bounds := list(_clipped_at(torque)):
+        if bounds := [bound for bound in _clipped_at(torque) if bound != stuck_Nm]:
             yield RecordingFinding(
                 f"the torque of {name} is clipped at {' and '.join(f'{bound:g}' for bound in bounds)} Nm",
                 CLIPPED_REMEDY,
@@ -455,12 +456,16 @@ def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | 
     """Return the first and the end index of the longest run of equal torques (k,) if the sensor is stuck, else None.
 
     The sensor is stuck if the run has at least `_STUCK_S` and 20 samples, some joint of q (k, n) moves in it, and the
-    other runs are `_STUCK_TIMES` shorter, by their 99 % quantile: a coarse sensor has many long runs. Runs at the
-    extreme readings are left out.
+    other runs are `_STUCK_TIMES` shorter, by their 99 % quantile: a coarse sensor has many long runs. Runs at an
+    extreme reading are left out unless one is `_STUCK_TIMES` longer than the others there: that sensor is dead.
     """
     runs = _runs(torque)
     lengths = runs[:, 1] - runs[:, 0]
-    lengths[np.isin(torque[runs[:, 0]], (torque.min(), torque.max()))] = 1  # a clipped sensor, reported elsewhere
+    for bound in (torque.min(), torque.max()):
+        at = torque[runs[:, 0]] == bound
+        *_, second, longest = 0, *np.sort(lengths[at])
+        if longest <= _STUCK_TIMES * second:
+            lengths[at] = 1  # a clipped sensor, reported elsewhere
     place = int(np.argmax(lengths))
     first, last = runs[place].tolist()
     usual = float(np.quantile(np.delete(lengths, place), 0.99)) if len(lengths) > 1 else 0.0
