@@ -137,6 +137,11 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     (f"{INIT} --at-zero up", USAGE, ("--at-zero is of an arm that gravity reaches",)),
     (f"{INIT} --eds float.eds", USAGE, ("its 0x6130:1 is a float, which no frame of a cycle can hold",)),
     (f"{INIT} --gear 3 3", USAGE, ("profile adacd-drive of joint 1 has its own `scale.gear_ratio` = 1;",)),
+    (
+        f"{INIT} --drive nope nope",
+        USAGE,
+        ("built in: adacd-drive, adacd-drive-fd, adacd-drive-fd-500us, maxon-epos4, stock-drive, zeroerr-erob",),
+    ),
     (f"{INIT} --drive maxon-epos4 stock-drive --gear 9 9", USAGE, ("profile stock-drive of joint 2 has its own",)),
     (f"{INIT} --sensor int32-sensor int32-sensor --torque-count-nm 1 1", USAGE, ("of joint 1 has its own",)),
     ("init new.toml --from . --length-m 1 1", USAGE, ("leave out --length-m",)),
