@@ -58,6 +58,8 @@ _BEYOND_LIMITS: Final = 3.0
 BEYOND_EFFORT: Final = 30.0
 """Factor on the effort of the URDF: mNm read as Nm are 1000 times too large."""
 
+IN_MAP: Final = "in the map: "
+"""Begins a remedy that is a line of the map; arrays have none."""
 CORRECT_UNITS: Final = "correct `columns`, `units` and `scale` of positions and torques"
 CLIPPED_REMEDY: Final = "move slower, or raise the range of that sensor"
 LEFT_OUT_REMEDY: Final = (
@@ -241,7 +243,7 @@ def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, 
     key: "q" or "tau_J". factor: on the scale of the joints meant. is_meant: (n,).
     """
     if is_meant.all():
-        return f'`units.{key}` = "{unit}", which the map has as "{getattr(described.units, key)}"'
+        return f'`units.{key}` = "{unit}" in place of "{getattr(described.units, key)}"'
     return described.scaled(key, np.where(is_meant, factor, 1.0))
 
 
@@ -439,7 +441,7 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
         keys = [f'`units.{key}` = "{unit}"' for key, unit in units_by_slope(described.units, abs(factor))]
         yield RecordingFinding(
             f"the velocity of {name} {how} its position's slope",
-            " or ".join([*(f"in the map: {key}" for key in keys), LEFT_OUT_REMEDY]),
+            " or ".join([*(f"{IN_MAP}{key}" for key in keys), LEFT_OUT_REMEDY]),
             is_wrong=True,
         )
         return
