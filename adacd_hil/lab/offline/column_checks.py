@@ -176,7 +176,7 @@ def _of_sources(described: RecordingMap, recordings: Sequence[ForeignRecording])
 def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
     """Report torques that are constant, stuck or clipped, and the one farthest over `BEYOND_EFFORT` times its effort.
 
-    Constant torques aren't checked for being stuck or clipped. The effort is the URDF's; currents aren't compared with
+    Constant torques aren't checked further. The effort is the URDF's; currents aren't compared with
     it.
     """
     n = described.joints
@@ -192,7 +192,7 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[Recordin
     for joint in (joint for joint in range(n) if joint not in constant):
         torque, name = columns.tau_J[:, joint], column_name(described, "tau_J", joint)
         run = _stuck_run(torque, columns.q, columns.period_s)
-        stuck_Nm = None if run is None else round(float(torque[run[0]]), 9)
+        run_Nm = None if run is None else round(float(torque[run[0]]), 9)
         if run is not None:
             seconds, start_s = (run[1] - run[0]) * columns.period_s, columns.time_s[run[0]]
             yield RecordingFinding(
@@ -200,7 +200,7 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[Recordin
                 "while the arm moves",
                 "leave that time out with --from and --until, and check the sensor",
             )
-        if bounds := [bound for bound in _clipped_at(torque) if bound != stuck_Nm]:
+        if bounds := [bound for bound in _clipped_at(torque) if bound != run_Nm]:
             yield RecordingFinding(
                 f"the torque of {name} is clipped at {' and '.join(f'{bound:g}' for bound in bounds)} Nm",
                 CLIPPED_REMEDY,
@@ -459,7 +459,7 @@ def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | 
 
     The sensor is stuck if the run has at least `_STUCK_S` and 20 samples, some joint of q (k, n) moves in it, and the
     other runs are `_STUCK_TIMES` shorter, by their 99 % quantile: a coarse sensor has many long runs. Runs at an
-    extreme reading are left out unless one is `_STUCK_TIMES` longer than the others there: that sensor is dead.
+    extreme reading are left out unless one is as much longer than the others there: that sensor is dead.
     """
     runs = _runs(torque)
     lengths = runs[:, 1] - runs[:, 0]
