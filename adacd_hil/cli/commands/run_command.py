@@ -117,6 +117,7 @@ def run_on_bus(
     with run_folder(out, (LOG_NAME,), "run") as folder, ExitStack() as stack, never_stopped():
         bus = connection.open(timer, codec, settings, devices)
         stack.callback(bus.close)
+        check_autonomy(settings, interface, channel)  # the channel may have come since
         drop_old_frames(bus, interface)
         operator: Operator = ScriptedOperator(settings.operator)
         progress = stack.enter_context(Progress())
