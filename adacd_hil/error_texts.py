@@ -3,6 +3,8 @@
 import errno
 import os
 
+from adacd_hil.printable import in_line
+
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -19,7 +21,7 @@ def is_disk_full(error: BaseException | None) -> bool:
 
 
 def error_text(error: BaseException) -> str:
-    """Return the text of an error; of an OSError file and reason, without its number."""
+    """Return the text of an error; of an OSError file, its line ends escaped, and reason, without its number."""
     if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+        return f"{in_line(str(error.filename))}: {error.strerror}" if error.filename else error.strerror
     return str(error)

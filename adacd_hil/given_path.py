@@ -1,6 +1,6 @@
-"""Additions to click for both command lines: checked paths, and command lists with whole summaries.
+"""Additions to click for both command lines: checked names and paths, and command lists with whole summaries.
 
-`GivenPath` and `WrittenPath` refuse paths, before any work, that `click.Path` lets pass.
+`GivenName`, `GivenPath` and `WrittenPath` refuse names and paths, before any work, that click lets pass.
 """
 
 import os
@@ -10,6 +10,16 @@ from typing import Any
 import click
 
 from adacd_hil.file_replacement import dangling_link
+
+
+class GivenName(click.types.StringParamType):
+    """A text that isn't empty."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the text. Raises click.BadParameter for an empty one."""
+        if value == "":
+            self.fail("the name is empty", param, ctx)
+        return super().convert(value, param, ctx)
 
 
 class GivenPath(click.Path):

@@ -456,3 +456,5 @@ class BriefedEvent(Event):
 
 CERTIFICATE_EVENTS: Final = frozenset(("anchor", "touch", "position", "certificate", "revoked", "sight"))
 """Names of the events about certificates: shown to the operator at once; a replay must repeat them."""
+BEGINS_ANEW: Final = "no certificate, learning begins anew"
+"""The clause of those events that withhold a certificate, behind the cause."""

@@ -2,6 +2,7 @@
 
 import os
 import pty
+import resource
 import socket
 import subprocess
 import sys
@@ -9,9 +10,35 @@ from pathlib import Path
 
 import pytest
 
+from adacd_hil.error_texts import error_text
 from adacd_hil.file_access import InUseError, check_unused, create_file, exists, open_input, read_input, write_new_file
 from adacd_hil.file_replacement import Replacement, removing_empty_folders, replace_file, replace_files, replacing
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.record_layout import MAGIC
+from adacd_hil.log.recording.recorder import Recorder
+
+
+def test_the_text_of_an_error_names_the_file_in_one_line_and_no_number(tmp_path):
+    with pytest.raises(FileNotFoundError) as raised:
+        read_input(tmp_path / "a\nb")
+    assert error_text(raised.value) == f"{tmp_path}/a\\u000ab: No such file or directory"
+
+
+def test_a_log_without_a_free_descriptor_is_refused_in_words(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    highest = max(int(file.name) for file in Path("/proc/self/fd").iterdir())
+    taken = [os.open(os.devnull, os.O_RDONLY)]
+    while taken[-1] < highest:
+        taken.append(os.open(os.devnull, os.O_RDONLY))
+    # Three more, for the log's file and the two sockets: none for the buffer.
+    resource.setrlimit(resource.RLIMIT_NOFILE, (taken[-1] + 1 + 3, hard))
+    try:
+        with pytest.raises(LogError, match=r"MiB: Too many open files$"):
+            Recorder(tmp_path / "run.mcap")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        for descriptor in taken:
+            os.close(descriptor)
 
 
 def make_socket(path: Path) -> None:

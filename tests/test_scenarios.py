@@ -4,9 +4,11 @@ from pathlib import Path
 
 import pytest
 from long_cases import long_but
+from mcap.reader import make_reader
 from played_outcome import deviations, expected_of, outcome_of
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
+from adacd_hil.clock import REALTIME, wall_ns
 from adacd_hil.log.reader import read_log
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.toml_text import to_short_toml, to_toml
@@ -121,3 +123,16 @@ def test_the_logs_of_a_short_scenario_name_it_and_its_faults(tmp_path: Path) -> 
     assert read_log(summary.log.path).metadata["scenario"] == "short"
     events = [entry.event.message for entry in read_log(truth_path).events]
     assert [text for text in events if text.startswith("begins: emcy_storm of sensor1")] != []
+
+
+@pytest.mark.slow
+@pytest.mark.wallclock
+def test_both_logs_of_a_run_in_real_time_have_the_date(tmp_path: Path) -> None:
+    path = tmp_path / "short.toml"
+    path.write_text("lasts_s = 0.1\n")
+    begun_ns = wall_ns()
+    summary, truth_path = run_embedded(resolve("paper", str(path), None, None), REALTIME, tmp_path)
+    for log in (summary.log.path, truth_path):
+        with log.open("rb") as file:
+            _, _, first = next(make_reader(file).iter_messages())
+        assert begun_ns <= first.log_time <= wall_ns()

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adacd_hil.cli.connection import make_clock, model_time
-from adacd_hil.clock import LOCKSTEP
+from adacd_hil.clock import LOCKSTEP, wall_offset_ns
 from adacd_hil.control.cycle_compilation import compiling_cycle
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveView, Session, SessionSummary
@@ -125,7 +125,14 @@ def run_embedded(
     bus = model_time(embedded, clock, codec, settings)
     out.mkdir(parents=True, exist_ok=True)
     host = {CONFIG_DIGEST_KEY: config_digest(to_toml(settings))}
-    with TruthLog(out / TRUTH_NAME, blocking=clock_name == LOCKSTEP, metadata=host, scenario=scenario) as truth:
+    is_lockstep = clock_name == LOCKSTEP
+    with TruthLog(
+        out / TRUTH_NAME,
+        blocking=is_lockstep,
+        metadata=host,
+        scenario=scenario,
+        epoch_ns=0 if is_lockstep else wall_offset_ns(),
+    ) as truth:
         try:
             touched_ns: int | None = None  # since when somebody touches the arm, for the progress lines alone
 

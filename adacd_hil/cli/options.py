@@ -24,7 +24,7 @@ from adacd_hil.cli.completion import (
 from adacd_hil.cli.output import PROGRAM, CommandError, ExitCode, explained
 from adacd_hil.clock import CLOCKS
 from adacd_hil.extras import install_command
-from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FOLDER, GivenPath
+from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FOLDER, GivenName, GivenPath
 from adacd_hil.log.log_files import MOST_VIEWERS
 from adacd_hil.settings.stated import ARM_PROFILES, BITRATES
 from adacd_hil.settings.toml_files import builtin_names
@@ -68,6 +68,7 @@ channel_option = functools.partial(
     click.option,
     "-c",
     "--channel",
+    type=GivenName(),
     help="Channel of that interface, such as can0.",
     shell_complete=complete_channel,
 )

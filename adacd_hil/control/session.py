@@ -23,6 +23,7 @@ from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity, Master
 from adacd_hil.device.profile import PlacedDevice, enable_timeout_s
 from adacd_hil.device.strangers import refuse_company
+from adacd_hil.error_texts import error_text
 from adacd_hil.file_access import write_new_file
 from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LAYOUT_NAME, LOG_NAME, SCRIPTED, arithmetic
 from adacd_hil.log.recording.processes import LiveService
@@ -333,8 +334,9 @@ class Session:
             try:
                 write()
             except OSError as error:
-                self.progress(f"beside the log: {error}")
-                recorder.event(self.clock.now_ns(), Event("warning", "log", f"beside the log: {error}"))
+                text = f"beside the log: {error_text(error)}"
+                self.progress(text)
+                recorder.event(self.clock.now_ns(), Event("warning", "log", text))
 
     def _metadata(self, grant: RealtimeGrant) -> dict[str, str]:
         settings = self.settings

@@ -37,7 +37,13 @@ def load_profile(name_or_file: str, kind: str) -> DeviceProfile:
     unknown name or key, a value outside its bounds, an EDS that is missing or can't be read, another kind. The EDS is
     not parsed.
     """
-    path = find_named("device profile", name_or_file, _builtin_folder())
+    folder = _builtin_folder()
+    path = find_named(
+        "device profile",
+        name_or_file,
+        folder,
+        is_shown=lambda name: _read_profile(Path(str(folder / f"{name}.toml")))[0]["kind"] == kind,
+    )
     try:
         table, folders = _read_profile(path)
         settings = parse(ProfileSettings, table)

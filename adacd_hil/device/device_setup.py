@@ -20,6 +20,7 @@ from adacd_hil.device.canopen_bus import (
     RefusedError,
     as_device_error,
     find_variable,
+    read_object,
 )
 from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, shows_mode, torque_limit_permille
 from adacd_hil.device.drive_units import name_velocity_unit, read_drive_units, unit_prefix
@@ -67,6 +68,13 @@ class Slave:
         """
         with as_device_error(self.name, self.node_id, f"reading {self.name_object(index, sub)}", self.answer_s):
             return int(self._entry(index, sub).raw)
+
+    def read_unlisted(self, index: int, sub: int) -> int:
+        """Read an object that the EDS doesn't list, an unsigned number, over SDO; return 0 if the device has none.
+
+        Raises DeviceError if the device refuses or doesn't answer, BusError if the bus fails.
+        """
+        return int.from_bytes(read_object(self._node, index, sub) or b"", "little")
 
     def write_object(self, index: int, sub: int, value: int) -> None:
         """Write a number to an object over SDO, and store it in `known`.

@@ -181,7 +181,7 @@ class Master(EventSource):
         return [self._identify(slave) for slave in self.slaves]
 
     def _identify(self, slave: Slave) -> Identity:
-        """Return a device's identity, 0 for entries that the EDS lacks.
+        """Return a device's identity, 0 for entries that the EDS lacks, but for a serial number that the profile names.
 
         Raises DeviceError for another node id than the DBC's, another device than the EDS's, another serial number than
         the profile's, and another contract in 0x2000, as far as the profile has these; BusError if the bus fails.
@@ -194,7 +194,9 @@ class Master(EventSource):
                 f'correct `devices.{profile.kind}_node`, or `devices.contract` = "" composes the frames',
             )
         device_type = slave.read(0x1000)
-        read = (slave.read(0x1018, sub) if slave.has(0x1018, sub) else 0 for sub in (1, 2, 3, 4))
+        read = [slave.read(0x1018, sub) if slave.has(0x1018, sub) else 0 for sub in (1, 2, 3, 4)]
+        if profile.serial and not slave.has(0x1018, 4):
+            read[3] = slave.read_unlisted(0x1018, 4)
         found = Identity(slave.name, slave.node_id, *read)
         quantity, difference, remedy = identity_difference(slave, device_type, found)
         if difference:

@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from collections.abc import Callable
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -105,17 +106,24 @@ def toml_names(folder: Traversable, suffix: str = ".toml") -> list[str]:
     return sorted(entry.name.removesuffix(suffix) for entry in folder.iterdir() if entry.name.endswith(suffix))
 
 
-def find_named(kind: str, name_or_file: str, folder: Traversable, suffix: str = ".toml") -> Path:
+def find_named(
+    kind: str,
+    name_or_file: str,
+    folder: Traversable,
+    suffix: str = ".toml",
+    is_shown: Callable[[str], bool] = lambda _: True,
+) -> Path:
     """Return the file of a built-in name in `folder`, or the given path; a path with a suffix may be missing.
 
     Raises ConfigError for any other name, with the nearest built-in one. kind: of the file, for the error. suffix: of
-    the files in the folder.
+    the files in the folder. is_shown: whether that error may show a built-in name.
     """
     names = toml_names(folder, suffix)
     if name_or_file in names:
         return Path(str(folder / f"{name_or_file}{suffix}"))
     path = Path(name_or_file)
     if not name_or_file or (not path.suffix and not exists(path)):
+        names = [name for name in names if is_shown(name)]
         nearest = nearest_name(name_or_file, names)
         some = ", ".join(names) if len(names) <= _MOST_NAMES else f"{len(names)}, such as {', '.join(names[:3])}"
         hint = f"; did you mean {nearest!r}?" if nearest else f"; built in: {some}"

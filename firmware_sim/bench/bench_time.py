@@ -83,10 +83,12 @@ class TruthLog(Recorder):
         blocking: bool,
         metadata: Mapping[str, str] | None = None,
         scenario: Scenario | None = None,
+        epoch_ns: int = 0,
     ) -> None:
         """Create the file. `blocking`: wait for the writer rather than lose a cycle.
 
-        scenario: attached, and its faults and truth are named in the metadata.
+        scenario: attached, and its faults and truth are named in the metadata. epoch_ns: added to t_ns for the log's
+        times.
 
         Raises LogExistsError if there is a log already, LogError if it can't be written.
         """
@@ -100,6 +102,7 @@ class TruthLog(Recorder):
                 **truth,
                 **{f"fault_{index}": row.timed_text for index, row in enumerate(faults)},
             },
+            epoch_ns=epoch_ns,
             blocking=blocking,
             messages=(),
             channels=truth_channels(),

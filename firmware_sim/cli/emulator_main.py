@@ -14,7 +14,7 @@ import click
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.error_texts import error_text
 from adacd_hil.file_replacement import removing_empty_folders
-from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
+from adacd_hil.given_path import CommandGroup, GivenName, GivenPath, WrittenPath
 from adacd_hil.log.log_files import SUFFIX, TRUTH_NAME, LogError, LogExistsError
 from adacd_hil.log.log_walk import run_metadata
 from adacd_hil.log.recording.run_folder import check_free
@@ -87,7 +87,7 @@ _OPTIONS = (  # last first: click lists them the other way round
         show_default=True,
         help="Which devices: DBC and EDS files of this name.",
     ),
-    click.option("-c", "--channel", required=True, help="Channel of the interface, such as vcan0."),
+    click.option("-c", "--channel", required=True, type=GivenName(), help="Channel of the interface, such as vcan0."),
     click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan."),
 )
 

@@ -26,7 +26,7 @@ from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.lab.score.run_arrays import split_sections
 from adacd_hil.lab.score.run_judge import step_delay_s
 from adacd_hil.log.reader import LoggedEvent
-from adacd_hil.records import ContactKind, ContactLevel, Event, Location, Reaction, SchemeState
+from adacd_hil.records import BEGINS_ANEW, ContactKind, ContactLevel, Event, Location, Reaction, SchemeState
 from adacd_hil.score.wording import NONE
 
 
@@ -173,6 +173,38 @@ def test_a_certificate_that_was_taken_back_is_what_the_verdict_begins_with_and_t
     assert metrics.verdict.startswith(f"{why}; ")
     assert not metrics.is_clean
     assert evaluated(make_certified_run()).is_clean
+
+
+def withheld(*events):
+    told = ((s, name, f"offset {s} Nm{clause}") for s, name, clause in events)
+    run = make_certified_run()
+    logged = (LoggedEvent(run.zero_ns + s * 10**9, Event("warning", name, text)) for s, name, text in told)
+    return replace(run, events=tuple(logged))
+
+
+BEGUN_ANEW = f"; {BEGINS_ANEW}; `accept` helps"
+
+
+@pytest.mark.parametrize(
+    ("events", "text"),
+    [
+        ((), ""),
+        (((1, "anchor", "; the drives stay off; `accept` helps"),), ""),
+        (((1, "touch", BEGUN_ANEW),), "a certificate was withheld from 1.00 s on: offset 1 Nm"),
+        (
+            ((1, "touch", BEGUN_ANEW), (2, "anchor", BEGUN_ANEW), (4, "certificate", ""), (5, "certificate", "")),
+            "a certificate was withheld from 1.00 to 4.00 s: offset 2 Nm",
+        ),
+        (
+            ((1, "touch", BEGUN_ANEW), (2, "certificate", ""), (6, "sight", BEGUN_ANEW), (7, "certificate", "")),
+            "certificates were withheld 2 times, last from 6.00 to 7.00 s: offset 6 Nm",
+        ),
+    ],
+)
+def test_a_verdict_names_for_how_long_and_why_certificates_were_withheld(events, text):
+    findings = evaluated(withheld(*events)).findings
+    assert [finding.text for finding in findings if "withheld" in finding.text] == [text] * bool(text)
+    assert evaluated(withheld(*events)).is_clean
 
 
 def touched_beside(row, crossing):

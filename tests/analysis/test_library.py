@@ -66,6 +66,13 @@ def test_a_model_of_one_recording_watches_another_and_names_of_others_are_taken(
     assert detect(renamed, arm, model=model).contacts == detect(arrays, arm, fit_s=(100.0, 105.0)).contacts
 
 
+def test_velocities_in_another_unit_are_told_without_a_map(arm, arrays):
+    verdict = fit({**arrays, "dq": np.rad2deg(arrays["dq"])}, arm).verdict
+    assert "times its position's slope" in verdict.reasons[0]
+    assert verdict.remedy.startswith('convert the arrays, as the map of a recording would: `units.dq` = "deg/s"')
+    assert "in the map" not in " ".join([*verdict.reasons, *verdict.remarks, verdict.remedy])
+
+
 @pytest.mark.parametrize("value", [0.0, 0.3])
 def test_no_contact_in_the_arrays_of_a_dead_logger_is_no_finding(arm, arrays, value):
     model = fit(arrays, arm, fit_s=(100.0, 105.0))

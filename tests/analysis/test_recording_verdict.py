@@ -84,6 +84,14 @@ def test_joints_are_explained_though_their_sensors_have_no_noise_and_the_margin_
     assert "contacts show from about joint" in remark
 
 
+def test_a_sensor_that_dies_is_stuck_and_not_clipped(tmp_path, upright):
+    verdict = judged(tmp_path, dead_from_the_middle_on(upright)).verdict
+    stuck = "the torque of joint1 (tau1) is stuck at 0 Nm for 4 s, from 8.005 s on, while the arm moves"
+    assert verdict.reasons[0] == stuck
+    assert "check the sensor" in verdict.remedy
+    assert "clipped" not in " ".join([*verdict.reasons, *verdict.remarks])
+
+
 def test_a_coarse_sensor_is_not_clipped_and_rare_rows_have_no_jump(tmp_path, upright):
     rare = record(urdf_text(2, UPRIGHT), 40.0, 0.05)
     for motion in (replace(upright, tau=upright.tau.round()), replace(rare, q=rare.q * [1.0, 1.9])):
@@ -103,6 +111,13 @@ def still(motion: Motion, *joints: int) -> Motion:
 def stuck(motion: Motion) -> Motion:
     tau = motion.tau.copy()
     tau[900:1100, 0] = tau[900, 0]
+    return replace(motion, tau=tau)
+
+
+def dead_from_the_middle_on(motion: Motion) -> Motion:
+    """Stop a sensor at 0 Nm, the largest of its readings, within the motion that is not fitted."""
+    tau = motion.tau.copy()
+    tau[1600:, 0] = 0.0
     return replace(motion, tau=tau)
 
 

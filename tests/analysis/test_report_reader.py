@@ -15,7 +15,7 @@ from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.lab.score.report_wording import STATE_WORDS, uncertain_text
 from adacd_hil.lab.score.run_arrays import Run
 from adacd_hil.log.reader import LoggedEvent
-from adacd_hil.records import Event, SchemeState
+from adacd_hil.records import BEGINS_ANEW, Event, SchemeState
 
 SOURCE = ReportSource("run.mcap")
 CSS = resources.files("adacd_hil.lab.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
@@ -68,6 +68,15 @@ def test_a_good_run_needs_nothing_and_says_so():
     assert nothing.text == "Nothing to do: all went well."
     replayed = "adacd-hil replay run.mcap"
     assert [step.command for step in further] == [replayed, f"{replayed} --set filter.a_rad_s=20"]
+
+
+def test_a_run_whose_certificate_was_withheld_first_names_it_and_does_not_call_all_well():
+    run = make_certified_run()
+    assert steps_of(run)[0].text == "Nothing to do: all went well."
+    refused = Event("warning", "touch", f"an offset; {BEGINS_ANEW}; `accept` says so")
+    texts = [step.text for step in steps_of(replace(run, events=(LoggedEvent(run.zero_ns, refused),)))]
+    assert texts[0].startswith("The arm was certified late. Leave it untouched")
+    assert "Nothing to do: all went well." not in texts
 
 
 def on_a_bus(run: Run, **said: str) -> Run:

@@ -6,9 +6,11 @@ import pty
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import can
 import pytest
+from bus_lab import SHORT_RUN, USAGE, Lab
 from called import called
 
 from adacd_hil.cli.connection import check_autonomy, check_clock
@@ -186,3 +188,14 @@ def test_an_arm_that_has_a_host_is_left_to_it(command, tmp_path, monkeypatch):
     assert refused.exit_code == ExitCode.BUS_MISSING
     line = f"somebody else sends this host's heartbeat (0x77F) on {command}: end the other program; an arm has one host"
     assert line in refused.stderr.splitlines()[-1]
+
+
+def test_a_channel_that_comes_while_the_run_begins_counts_as_hardware(tmp_path: Path, monkeypatch) -> None:
+    lab = Lab(tmp_path, monkeypatch)
+    lab.settings_file.write_text("[operator]\nacknowledge_after_s = 0.5\n" + SHORT_RUN.removeprefix("[operator]\n"))
+    found = iter((False, False, True))
+    monkeypatch.setattr("adacd_hil.cli.connection.may_be_hardware", lambda interface, channel: next(found))
+    result = lab.run()
+    assert (result.exit_code, "acknowledges by itself" in result.stderr) == (USAGE, True)
+    assert next(found, None) is None
+    assert not (tmp_path / "run.mcap").exists()

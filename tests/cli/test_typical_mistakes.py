@@ -76,6 +76,8 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("runs . --since yesterday", USAGE, ("'yesterday' is no date such as 2026-11-25",)),
     # -- the bus
     ("run -i sockecan -c can0", BUS_MISSING, ("unknown interface 'sockecan'", "did you mean 'socketcan'?")),
+    ("run -i socketcan -c ''", USAGE, ("Invalid value for '-c' / '--channel': the name is empty", "run --help")),
+    ("run -i socketcan -c cann0 --config demo", BUS_MISSING, ("CAN interface cann0 does not exist",)),
     ("scan -i socketcan -c cann0", BUS_MISSING, ("CAN interface cann0 does not exist", "did you mean 'can0'?")),
     ("run -i socketcan -c can0 --without-anchor", BUS_MISSING, ("CAN interface can0 is down", "ip link set can0 up")),
     ("run -i slcan -c tty1 --clock lockstep", USAGE, ("lockstep is for emulated arms", "it needs --clock realtime")),
@@ -135,6 +137,11 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     (f"{INIT} --at-zero up", USAGE, ("--at-zero is of an arm that gravity reaches",)),
     (f"{INIT} --eds float.eds", USAGE, ("its 0x6130:1 is a float, which no frame of a cycle can hold",)),
     (f"{INIT} --gear 3 3", USAGE, ("profile adacd-drive of joint 1 has its own `scale.gear_ratio` = 1;",)),
+    (
+        f"{INIT} --drive nope nope",
+        USAGE,
+        ("built in: adacd-drive, adacd-drive-fd, adacd-drive-fd-500us, maxon-epos4, stock-drive, zeroerr-erob",),
+    ),
     (f"{INIT} --drive maxon-epos4 stock-drive --gear 9 9", USAGE, ("profile stock-drive of joint 2 has its own",)),
     (f"{INIT} --sensor int32-sensor int32-sensor --torque-count-nm 1 1", USAGE, ("of joint 1 has its own",)),
     ("init new.toml --from . --length-m 1 1", USAGE, ("leave out --length-m",)),

@@ -1,10 +1,12 @@
 """The survey finds who is on the bus by SDO uploads and listening, and disturbs nobody."""
 
 import dataclasses
+from contextlib import nullcontext
 
 import pytest
 from rig import CODEC, Rig
 
+from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.device_setup import Slave
 from adacd_hil.lab.commission.survey import Survey, compare, function_name, message_name, survey
 
@@ -76,6 +78,17 @@ def test_a_device_of_the_other_joint_is_known_by_its_serial_number():
         1: "Drive1 expected; serial number 0x1018:4 = 11, 12 expected",
         2: "Drive2 expected; serial number 0x1018:4 = 12, 11 expected",
     }
+
+
+@pytest.mark.parametrize(("serial", "difference"), [((1, 2), ""), ((9, 2), "serial number 0x1018:4 = 1, 9 expected")])
+def test_a_serial_number_that_the_eds_lacks_is_read_by_run_as_by_scan(monkeypatch, serial, difference):
+    rig = Rig(is_wall=True)
+    slave = rig.master.slaves[0]
+    monkeypatch.delitem(slave._node.object_dictionary[0x1018].subindices, 4)
+    replace_profile(slave, serial=serial)
+    with pytest.raises(DeviceError, match=difference) if difference else nullcontext():
+        assert rig.master.identify()[0].serial == 1
+    assert verdicts(rig, look(rig))[1].endswith(difference)
 
 
 def test_a_node_that_is_only_heard_is_found_and_does_not_answer():

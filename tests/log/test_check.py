@@ -279,6 +279,25 @@ def test_what_mcaps_own_writer_makes_breaks_no_rule(compression, tmp_path):
     assert check_log(tmp_path / "log.mcap").findings == []
 
 
+def test_messages_in_a_row_outside_of_chunks_are_checked_together_up_to_the_next_record(tmp_path):
+    """One by one, those of a log of 10 s took a minute."""
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file, use_chunking=False, enable_data_crcs=True)
+        writer.start("ros2", "somebody")
+        schema = writer.register_schema("x/msg/X", "ros2msg", b"uint8 x\n")
+        for topic in ("/x", "/y"):
+            channel = writer.register_channel(topic, "cdr", schema)
+            for t_ns in (9, 8, 7):
+                writer.add_message(channel, t_ns, b"\0\1\0\0x", 0)
+        writer.finish()
+    found = check_log(tmp_path / "log.mcap")
+    back = "2 messages are earlier than the one before in their channel, the first on"
+    assert [finding.text for finding in found.findings] == [f"{back} /x by 1 ns", f"{back} /y by 1 ns"]
+    places = [finding.offset for finding in found.findings]
+    assert places == sorted(set(places))
+    assert found.messages == 6
+
+
 def test_many_findings_of_one_rule_are_counted_and_ten_told(tmp_path):
     data = make_log(chunks=[(number, number + 1) for number in range(30)], make_payload=lambda number: b"")
     found = check(tmp_path / "log.mcap", data)

@@ -32,6 +32,7 @@ from adacd_hil.control.tare_file import TARED, UsedTare, use_tare
 from adacd_hil.dates import format_date
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import place_devices
+from adacd_hil.error_texts import error_text
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.viewer_layout import viewer_files
 from adacd_hil.printable import in_line, number_of, one_line
@@ -116,6 +117,7 @@ def run_on_bus(
     with run_folder(out, (LOG_NAME,), "run") as folder, ExitStack() as stack, never_stopped():
         bus = connection.open(timer, codec, settings, devices)
         stack.callback(bus.close)
+        check_autonomy(settings, interface, channel)  # the channel may have come since
         drop_old_frames(bus, interface)
         operator: Operator = ScriptedOperator(settings.operator)
         progress = stack.enter_context(Progress())
@@ -149,8 +151,8 @@ def run_on_bus(
         try:
             described["history"] = known.add_certificates(summary.certificates, summary.identities, origin)
         except (OSError, ConfigError) as error:
-            described["history_error"] = str(error)
-            print(in_line(f"adacd-hil: the certificate is not in the history: {error}"), file=sys.stderr)
+            described["history_error"] = error_text(error)
+            print(in_line(f"adacd-hil: the certificate is not in the history: {error_text(error)}"), file=sys.stderr)
             code = ExitCode.PARTIAL if code is ExitCode.OK else code
     return described, code
 

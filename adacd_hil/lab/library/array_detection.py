@@ -6,7 +6,7 @@ friction and the torque sensors' offsets are identified.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from adacd_hil.file_access import read_input
+from adacd_hil.lab.offline.column_checks import IN_MAP
 from adacd_hil.lab.offline.recorded_columns import LARGEST, SHORTEST_SAMPLES, RecordedColumns
 from adacd_hil.lab.offline.recording_identification import Identified, examined, identify, watch
 from adacd_hil.lab.offline.recording_import import (
@@ -140,8 +141,13 @@ class FittedModel:
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict of the test: whether the model explains the torque, with reasons, remarks and the next step."""
-        return self.identified.verdict
+        """The verdict of the test: whether the model explains the torque, with reasons, remarks and the next step.
+
+        A step that is a line of a recording's map names it as a conversion of the arrays.
+        """
+        verdict = self.identified.verdict
+        remedy = verdict.remedy.replace(IN_MAP, "convert the arrays, as the map of a recording would: ")
+        return replace(verdict, remedy=remedy)
 
     def __repr__(self) -> str:
         return f"<Model of {number_of(self.arm.joints, 'joint')}: {self.verdict.headline}>"

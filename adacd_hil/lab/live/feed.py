@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from adacd_hil.error_texts import error_text
 from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.lab.live.scene import (
     DESCRIPTION_TOPIC,
@@ -120,7 +121,7 @@ class LiveFeed:
                 os.close(notices)
         except OSError as error:
             self._socket.close()
-            raise LogError(f"the live view can't start: {error}") from None
+            raise LogError(f"the live view can't start: {error_text(error)}") from None
         finally:
             theirs.close()
         word = self._hear()

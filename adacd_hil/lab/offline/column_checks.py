@@ -58,6 +58,8 @@ _BEYOND_LIMITS: Final = 3.0
 BEYOND_EFFORT: Final = 30.0
 """Factor on the effort of the URDF: mNm read as Nm are 1000 times too large."""
 
+IN_MAP: Final = "in the map: "
+"""Begins a remedy that is a line of the map; arrays have none."""
 CORRECT_UNITS: Final = "correct `columns`, `units` and `scale` of positions and torques"
 CLIPPED_REMEDY: Final = "move slower, or raise the range of that sensor"
 LEFT_OUT_REMEDY: Final = (
@@ -174,7 +176,7 @@ def _of_sources(described: RecordingMap, recordings: Sequence[ForeignRecording])
 def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
     """Report torques that are constant, stuck or clipped, and the one farthest over `BEYOND_EFFORT` times its effort.
 
-    Constant torques aren't checked for being stuck or clipped. The effort is the URDF's; currents aren't compared with
+    Constant torques aren't checked further. The effort is the URDF's; currents aren't compared with
     it.
     """
     n = described.joints
@@ -190,6 +192,7 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[Recordin
     for joint in (joint for joint in range(n) if joint not in constant):
         torque, name = columns.tau_J[:, joint], column_name(described, "tau_J", joint)
         run = _stuck_run(torque, columns.q, columns.period_s)
+        run_Nm = None if run is None else round(float(torque[run[0]]), 9)
         if run is not None:
             seconds, start_s = (run[1] - run[0]) * columns.period_s, columns.time_s[run[0]]
             yield RecordingFinding(
@@ -197,7 +200,7 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[Recordin
                 "while the arm moves",
                 "leave that time out with --from and --until, and check the sensor",
             )
-        if bounds := list(_clipped_at(torque)):
+        if bounds := [bound for bound in _clipped_at(torque) if bound != run_Nm]:
             yield RecordingFinding(
                 f"the torque of {name} is clipped at {' and '.join(f'{bound:g}' for bound in bounds)} Nm",
                 CLIPPED_REMEDY,
@@ -240,7 +243,7 @@ def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, 
     key: "q" or "tau_J". factor: on the scale of the joints meant. is_meant: (n,).
     """
     if is_meant.all():
-        return f'`units.{key}` = "{unit}", which the map has as "{getattr(described.units, key)}"'
+        return f'`units.{key}` = "{unit}" in place of "{getattr(described.units, key)}"'
     return described.scaled(key, np.where(is_meant, factor, 1.0))
 
 
@@ -438,7 +441,7 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
         keys = [f'`units.{key}` = "{unit}"' for key, unit in units_by_slope(described.units, abs(factor))]
         yield RecordingFinding(
             f"the velocity of {name} {how} its position's slope",
-            " or ".join([*(f"in the map: {key}" for key in keys), LEFT_OUT_REMEDY]),
+            " or ".join([*(f"{IN_MAP}{key}" for key in keys), LEFT_OUT_REMEDY]),
             is_wrong=True,
         )
         return
@@ -455,12 +458,16 @@ def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | 
     """Return the first and the end index of the longest run of equal torques (k,) if the sensor is stuck, else None.
 
     The sensor is stuck if the run has at least `_STUCK_S` and 20 samples, some joint of q (k, n) moves in it, and the
-    other runs are `_STUCK_TIMES` shorter, by their 99 % quantile: a coarse sensor has many long runs. Runs at the
-    extreme readings are left out.
+    other runs are `_STUCK_TIMES` shorter, by their 99 % quantile: a coarse sensor has many long runs. Runs at an
+    extreme reading are left out unless one is as much longer than the others there: that sensor is dead.
     """
     runs = _runs(torque)
     lengths = runs[:, 1] - runs[:, 0]
-    lengths[np.isin(torque[runs[:, 0]], (torque.min(), torque.max()))] = 1  # a clipped sensor, reported elsewhere
+    for bound in (torque.min(), torque.max()):
+        at = torque[runs[:, 0]] == bound
+        *_, second, longest = 0, *np.sort(lengths[at])
+        if longest <= _STUCK_TIMES * second:
+            lengths[at] = 1  # a clipped sensor, reported elsewhere
     place = int(np.argmax(lengths))
     first, last = runs[place].tolist()
     usual = float(np.quantile(np.delete(lengths, place), 0.99)) if len(lengths) > 1 else 0.0

@@ -25,6 +25,7 @@ import numpy as np
 from adacd_hil.lab.offline.column_checks import (
     CLIPPED_REMEDY,
     CORRECT_UNITS,
+    IN_MAP,
     LEFT_OUT_REMEDY,
     RecordingFinding,
     clipped_torque,
@@ -257,9 +258,8 @@ def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Ite
     text = ", or ".join(reading.text for reading in readings[:3])
     by_map, where = percent(_least_share(joints)), " at the worst joint" if len(joints) > 1 else ""
     yield RecordingFinding(
-        f"{text}: so {percent(1.0 - readings[0].unexplained)} of the torque is explained{where}, {by_map} as the map "
-        "has it",
-        f"in the map: {', or '.join(dict.fromkeys(reading.remedy for reading in readings[:3]))}",
+        f"{text}: so {percent(1.0 - readings[0].unexplained)} of the torque is explained{where}, {by_map} as given",
+        f"{IN_MAP}{', or '.join(dict.fromkeys(reading.remedy for reading in readings[:3]))}",
     )
 
 
@@ -366,10 +366,10 @@ def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFi
         turns = {unit: ANGLE_RAD[unit] / ANGLE_RAD[units.q] for unit in UNITS if unit != units.q}
         angle = [unit for unit, factor in turns.items() if 0.8 < abs(scale) / factor < 1.25]
         if meant:
-            yield RecordingFinding(f"{text}: they are {meant}", f'in the map: `units.tau_J` = "{meant}"')
+            yield RecordingFinding(f"{text}: they are {meant}", f'{IN_MAP}`units.tau_J` = "{meant}"')
             return
         if angle and least >= WHOLE:
-            remedy = f'in the map: `units.q` = "{angle[0]}"'
+            remedy = f'{IN_MAP}`units.q` = "{angle[0]}"'
             yield RecordingFinding(f"{text}: the positions are {UNITS[angle[0]]}", remedy)
             return
         if not 1.0 / _ODD_SCALE <= abs(scale) <= _ODD_SCALE:

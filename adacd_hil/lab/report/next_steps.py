@@ -13,7 +13,7 @@ from adacd_hil.lab.report.page import STEPS, went_wrong
 from adacd_hil.lab.score.metrics import Metrics, ReportSource
 from adacd_hil.lab.score.run_arrays import EMULATOR, Run
 from adacd_hil.lab.score.run_faults import find_breaks
-from adacd_hil.lab.score.verdict import is_margin_below_1, is_revoked, shows_nothing
+from adacd_hil.lab.score.verdict import is_margin_below_1, is_revoked, shows_nothing, withheld_text
 from adacd_hil.log.log_files import EMBEDDED
 from adacd_hil.printable import in_line
 from adacd_hil.settings.toml_files import builtin_names, toml_names
@@ -65,6 +65,11 @@ def _repairs(metrics: Metrics, run: Run, source: ReportSource) -> list[NextStep]
         (
             is_revoked(metrics.evidence),
             NextStep("The certificate was taken back. Remove the cause, then let the arm learn anew, untouched."),
+        ),
+        (
+            bool(withheld_text(run)) and None not in metrics.adaptation_s.values(),
+            NextStep("The arm was certified late. Leave it untouched while it learns; if nobody touched it, the "
+                     "notices name the remedy."),
         ),
         (
             not has_stopped and not run.is_cut and None in metrics.adaptation_s.values(),

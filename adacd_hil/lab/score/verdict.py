@@ -28,7 +28,7 @@ from adacd_hil.lab.score.run_faults import Break
 from adacd_hil.lab.score.run_judge import uncovered_watch
 from adacd_hil.log.logged_run import is_armed_in
 from adacd_hil.printable import number_of
-from adacd_hil.records import JOINTS
+from adacd_hil.records import BEGINS_ANEW, JOINTS
 from adacd_hil.score.judge import Score
 from adacd_hil.score.smallest_push import PUSH_WITHIN
 from adacd_hil.score.wording import NONE, found_text
@@ -88,7 +88,7 @@ def list_findings(
         findings.append(Finding(_SHOWS_NOTHING, True))
     elif adaptation_s or not run.is_part:  # a part of a run need not have any
         findings.append(Finding(identified, not adaptation_s or None in adaptation_s.values()))
-    findings += [Finding(beside), Finding(data_text(data), bool(data.excesses))]
+    findings += [Finding(withheld_text(run)), Finding(beside), Finding(data_text(data), bool(data.excesses))]
     return tuple(finding for finding in findings if finding.text)
 
 
@@ -176,6 +176,29 @@ def is_margin_below_1(evidence: CertifiedEvidence | None) -> TypeGuard[Certified
 def is_revoked(evidence: CertifiedEvidence | None) -> TypeGuard[CertifiedEvidence]:
     """Return whether some certificate was taken back; False for the paper's scheme."""
     return evidence is not None and bool(evidence.revoked)
+
+
+def withheld_text(run: Run) -> str:
+    """Return a text on the last certificate that was withheld: how long, s since motion start, and why; "" without.
+
+    Of more than one, each ended by a certificate, it has the number.
+    """
+    begun_s: float | None = None
+    spans, cause = list[str](), ""
+    for t_ns, event in run.events:
+        at_s = (t_ns - run.zero_ns) * 1e-9
+        why, consequence, _ = event.message.partition(f"; {BEGINS_ANEW}")
+        if consequence:
+            begun_s, cause = at_s if begun_s is None else begun_s, why
+        elif event.name == "certificate" and begun_s is not None:
+            spans.append(f"from {begun_s:.2f} to {at_s:.2f} s")
+            begun_s = None
+    if begun_s is not None:
+        spans.append(f"from {begun_s:.2f} s on")
+    if not spans:
+        return ""
+    what = "a certificate was withheld" if len(spans) == 1 else f"certificates were withheld {len(spans)} times, last"
+    return f"{what} {spans[-1]}: {cause}"
 
 
 def _fault_texts(faults: tuple[Fault, ...]) -> list[str]:

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, Self
 
+from adacd_hil.error_texts import error_text
 from adacd_hil.file_access import create_file
 from adacd_hil.log.log_files import LogError, LogExistsError
 from adacd_hil.log.log_parts import parts_of
@@ -129,7 +130,8 @@ class Recorder:
             )
         except OSError as error:
             self._socket.close()
-            raise LogError(f"log {path}: no writer with a buffer of {settings.buffer_MiB} MiB: {error}") from None
+            lack = f"no writer with a buffer of {settings.buffer_MiB} MiB: {error_text(error)}"
+            raise LogError(f"log {path}: {lack}") from None
         finally:
             theirs.close()
             os.close(file)

@@ -17,6 +17,7 @@ import struct
 import sys
 
 from adacd_hil.clock import Clock, MonotonicClock
+from adacd_hil.error_texts import error_text
 from adacd_hil.log.log_files import CLOSED, CONTINUED, ENDING_KEY, PART_KEY, PRODUCT, LogError, part_path
 from adacd_hil.log.mcap.chunked_file import FLUSH_PERIOD_NS
 from adacd_hil.log.recording import processes
@@ -268,7 +269,7 @@ def write_log(connection: socket.socket, file_descriptor: int, ring_descriptor: 
         sink.say = _say
         url = process.live.url if process.live else ""
     except (LogError, OSError, ValueError) as reason:
-        error = " ".join(str(reason).split())
+        error = " ".join(error_text(reason).split())
     _send(connection, json.dumps({"error": error, "live_url": url}).encode())
     if not error:
         process.run()

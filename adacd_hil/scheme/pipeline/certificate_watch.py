@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adacd_hil.records import JOINTS, BriefedEvent, Event, SchemeState, Vector
+from adacd_hil.records import BEGINS_ANEW, JOINTS, BriefedEvent, Event, SchemeState, Vector
 from adacd_hil.scheme.detect import sight
 from adacd_hil.scheme.identify import anchor, certificate, earlier, missing_torque, place_bound
 from adacd_hil.scheme.identify.certificate import Certificate
@@ -25,27 +25,26 @@ _CHANGED = (
     "what the model doesn't know"
 )
 _OR_MOUNTING = ", such as gravity that acts otherwise than arm.mounting_deg says"
-_BEGINS_ANEW = "no certificate, learning begins anew"
 _POSITION_REMEDY = "if it is the arm's, `arm.position_torque_Nm` lets the model have it, from the next start on"
 
 
 _CONTRADICTIONS = {
     certificate.READING: ("anchor", "the drives stay off", "`accept` does without the tare"),
-    certificate.ANCHOR: ("anchor", _BEGINS_ANEW, "`accept` takes it for the sensor's zero"),
-    certificate.CHANGED: ("touch", _BEGINS_ANEW, "nobody may touch an arm that learns"),
-    certificate.MORE: ("touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm"),
-    certificate.BY_PLACE: ("position", _BEGINS_ANEW, _POSITION_REMEDY),
+    certificate.ANCHOR: ("anchor", BEGINS_ANEW, "`accept` takes it for the sensor's zero"),
+    certificate.CHANGED: ("touch", BEGINS_ANEW, "nobody may touch an arm that learns"),
+    certificate.MORE: ("touch", BEGINS_ANEW, "`accept` says that nobody touches the arm"),
+    certificate.BY_PLACE: ("position", BEGINS_ANEW, _POSITION_REMEDY),
     certificate.TOO_MUCH_BY_PLACE: (
         "position",
-        _BEGINS_ANEW,
+        BEGINS_ANEW,
         "who holds the arm shall let go, or that bound is too small",
     ),
     certificate.MORE_THAN_LAST: (
         "touch",
-        _BEGINS_ANEW,
+        BEGINS_ANEW,
         "`accept` says that nobody touches the arm, which has changed",
     ),
-    certificate.BLIND: ("sight", _BEGINS_ANEW, "`relearn` learns the arm anew"),
+    certificate.BLIND: ("sight", BEGINS_ANEW, "`relearn` learns the arm anew"),
 }
 """By contradiction: name of the event, consequence, remedy."""
 

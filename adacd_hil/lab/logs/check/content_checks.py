@@ -141,9 +141,10 @@ class ContentCheck:
         self._checks: dict[int, Callable[[bytes], bool]] = {}  # of payloads that don't have that size
 
     def messages(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
-        """Check times and cdr payloads of the messages of a chunk; add findings. offset: of the chunk in the file.
+        """Check times and cdr payloads of messages in a row; add findings.
 
-        Times are also compared with those of earlier calls.
+        offset: of their chunk, or of the first message outside of chunks, in the file. Times are also compared with
+        those of earlier calls.
         """
         for number in np.unique(contents.channels).tolist():
             if number not in self._described and number in definitions.channels:
@@ -173,7 +174,7 @@ class ContentCheck:
             channel = definitions.channels.get(number)
             back_ns = int(before[backwards[0]]) - int(times[backwards[0]])
             text = (
-                f"{len(backwards)} messages of a chunk are earlier than the one before in their channel, the first on "
+                f"{len(backwards)} messages are earlier than the one before in their channel, the first on "
                 f"{channel.topic if channel else number} by {back_ns} ns"
             )
             self._findings.add_finding("order", text, offset)
@@ -194,7 +195,7 @@ class ContentCheck:
         for place in np.flatnonzero(is_wrong)[:1].tolist():
             channel = definitions.channels[int(contents.channels[place])]
             count = np.count_nonzero(is_wrong)
-            text = f"{count} messages of a chunk aren't as their schemas say, the first on {channel.topic}"
+            text = f"{count} messages aren't as their schemas say, the first on {channel.topic}"
             self._findings.add_finding("cdr", text, offset)
 
 

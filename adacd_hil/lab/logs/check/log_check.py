@@ -87,6 +87,7 @@ class _FileCheck:
         self._file.seek(end)
         self._has_trailer = bool(self._counts[Opcode.FOOTER]) and self._file.read(len(MAGIC)) == MAGIC
         self._chunks.end_indexes()
+        self._chunks.end_messages()
         self._finish()
         counts, channels = self._chunks.counts, self._definitions.channels
         self.messages = int(counts.sum())
@@ -103,11 +104,13 @@ class _FileCheck:
         """Add a record to the CRC of its section and check it; a DataEnd ends the data section.
 
         A record that can't be parsed makes a finding. A record other than a MessageIndex ends the indexes of the latest
-        chunk.
+        chunk, one other than a Message the messages in a row outside of chunks.
         """
         head = HEAD.pack(record.opcode, len(record.body))
         if record.opcode != Opcode.MESSAGE_INDEX:
             self._chunks.end_indexes()
+        if record.opcode != Opcode.MESSAGE:
+            self._chunks.end_messages()
         if record.opcode == Opcode.DATA_END:
             self._data_end(record)
             return

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.lab.logs.check.content_checks import ContentCheck, DefinitionCheck
 from adacd_hil.lab.logs.check.findings import Findings
-from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, message_contents, read_contents
+from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, read_contents
 from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, RawRecord, name_of, parse
 from adacd_hil.log.mcap.record_layout import HEAD, INDEX_ENTRY
 
@@ -50,6 +50,8 @@ class ChunkFacts:
     is_indexed: bool = False
 
 
+_OUTSIDE_BYTES = 1 << 20
+"""Messages outside of chunks are checked together: one by one, 150,000 took 1 min."""
 _INDEXED = (
     "chunk_length",
     "message_start_time",
@@ -89,6 +91,8 @@ class ChunkCheck:
         self._latest: ChunkFacts | None = None  # whose indexes may follow
         self._expected: dict[int, NDArray[Any]] | None = None  # entries of its indexes; None where it can't be opened
         self._offsets: dict[int, int] = {}
+        self._outside = bytearray()  # messages outside of chunks that are not checked yet
+        self._outside_at = 0  # place of the first of them in the file
 
     def chunk(self, record: RawRecord) -> None:
         """Check a chunk, its messages and definitions; add findings.
@@ -185,17 +189,30 @@ class ChunkCheck:
         self._latest = None
 
     def message(self, record: RawRecord) -> None:
-        """Check and count a message outside of chunks: its channel, time and payload; add findings.
+        """Keep a message outside of chunks for `end_messages`, which is called at `_OUTSIDE_BYTES`.
 
         Sets `has_outside`.
         """
         self.has_outside = True
-        self._messages(message_contents(record), record.offset)
+        if not self._outside:
+            self._outside_at = record.offset
+        self._outside += HEAD.pack(record.opcode, len(record.body)) + record.body
+        if len(self._outside) >= _OUTSIDE_BYTES:
+            self.end_messages()
+
+    def end_messages(self) -> None:
+        """Check and count the messages outside of chunks since the last call: channel, time, payload; add findings.
+
+        Call it at each record that is no message, and at the end.
+        """
+        if self._outside:
+            self._messages(read_contents(bytes(self._outside)), self._outside_at)
+            self._outside.clear()
 
     def _messages(self, contents: Contents, offset: int) -> None:
         """Check and count messages and the definitions between them; add findings.
 
-        offset: of the chunk or message in the file.
+        offset: of the chunk, or of the first message, in the file.
         """
         channels, firsts = np.unique(contents.channels, return_index=True)
         first_at = dict(zip(channels.tolist(), contents.starts[firsts].tolist(), strict=True))
