@@ -375,7 +375,7 @@ class RunReading:
 
     @property
     def _settling_s(self) -> float:
-        return SETTLING_TIME_CONSTANTS / self._rows.run(self._shell, slice(0)).a_rad_s
+        return SETTLING_TIME_CONSTANTS / self._shell.settings.cutoff_rad_s
 
     def is_settled(self, until_ns: int, last_ns: int) -> bool:
         """Return whether contacts, reactions and adaptations from before `until_ns` are over at the cycle at `last_ns`.
@@ -667,7 +667,7 @@ def _busy(run: Run) -> Iterator[tuple[float, float]]:
 
     A margin before and the settling time after are included.
     """
-    later_s = SETTLING_TIME_CONSTANTS / run.a_rad_s
+    later_s = SETTLING_TIME_CONSTANTS / run.settings.cutoff_rad_s
     for stay in stays_of(run):
         if stay.state in BUSY:
             yield stay.start_s - MARGIN_S, stay.end_s + later_s

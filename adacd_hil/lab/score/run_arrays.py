@@ -262,12 +262,6 @@ class Run:
         """Whether the configuration has a CAD model, `arm.cad_theta`."""
         return len(self.settings.arm.cad_theta) > 0
 
-    @property
-    def a_rad_s(self) -> float:
-        """Cut-off of the filter of `tau_ext_hat`, rad/s: the slowest of the certified scheme's bank, or the paper's."""
-        is_certified = self.certified is not None
-        return self.settings.certified.cutoffs_rad_s[0] if is_certified else self.settings.filter.a_rad_s
-
     def time_s(self) -> Vector:
         """Return the time of each cycle since motion start, s (n,)."""
         # Subtracted as integers: float64 resolves only 256 ns of an absolute time.
