@@ -225,6 +225,8 @@ class Reaction(IntEnum):
     SLOW_DOWN = 5  # continues on its path at a fraction of the speed
 
 
+MOTION_START = SchemeState.ADAPT
+"""The times of a run count from its first cycle in this state."""
 BEGINNING = SchemeState.INIT, SchemeState.COMMISSION
 LEARNING = SchemeState.ADAPT, SchemeState.CERTIFY
 REACTING = SchemeState.REACT, SchemeState.STOPPED

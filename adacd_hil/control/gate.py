@@ -4,7 +4,7 @@ import math
 from enum import IntFlag
 
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.settings.arm_settings import MOST_BLIND_CYCLES, ArmSettings
+from adacd_hil.settings.arm_settings import MOST_BLIND_CYCLES, OLD_CYCLES, ArmSettings
 
 
 class GateFlag(IntFlag):
@@ -15,7 +15,7 @@ class GateFlag(IntFlag):
     RATE = 2  # clipped to torque_rate_limit_Nm_s
     NOT_A_NUMBER = 4  # a desired torque was not finite; all torques are zero
     CLOSED = 8  # torque is not allowed in this state; all torques are zero
-    HELD = 16  # the feedback is older than a cycle: the torque may fall and not grow
+    HELD = 16  # the feedback is older than OLD_CYCLES: the torque may fall and not grow
 
 
 FADING = 0.8
@@ -35,7 +35,8 @@ class Gate:
 
         `arm.torque_limit_Nm` limits the torque, `arm.torque_rate_limit_Nm_s` its rate. is_open: False makes it zero at
         once; after that it rises at the limited rate. A `tau_d` that isn't finite makes it zero, too. `age`: of the
-        feedback in cycles; beyond 1 the torque can't grow, beyond MOST_BLIND_CYCLES it fades. Call it once per cycle.
+        feedback in cycles; beyond OLD_CYCLES the torque can't grow, beyond MOST_BLIND_CYCLES it fades. Call it once per
+        cycle.
         """
         desired = tau_d.tolist()
         if not all(map(math.isfinite, desired)):
@@ -46,7 +47,7 @@ class Gate:
         for joint in range(JOINTS):
             last, step, bound = self._last_Nm[joint], self._step_Nm[joint], self._limit_Nm[joint]
             wanted = desired[joint]
-            if age > 1:
+            if age > OLD_CYCLES:
                 most = last if age <= MOST_BLIND_CYCLES else FADING * last
                 kept = min(max(wanted, min(most, 0.0)), max(most, 0.0))
                 flags |= GateFlag.HELD if kept != wanted else GateFlag.NONE

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Protocol
 
-from adacd_hil.records import ContactLevel, ContactReport, Reaction, Request, SchemeOutput, SchemeState
+from adacd_hil.records import MOTION_START, ContactLevel, ContactReport, Reaction, Request, SchemeOutput, SchemeState
 from adacd_hil.settings.run_settings import OperatorSettings
 
 
@@ -122,10 +122,10 @@ class RunNarration:
     def transition(self, t_ns: int, output: SchemeOutput, logged: str) -> None:
         """Print a change of state in words for the user, with the states' names and the details of its line in the log.
 
-        logged: that line. The first change to ADAPT begins the time that `event` prints.
+        logged: that line. The first change to MOTION_START begins the time that `event` prints.
         """
         names, _, details = logged.partition(": ")
-        if output.state is SchemeState.ADAPT and self._enabled_ns is None:
+        if output.state is MOTION_START and self._enabled_ns is None:
             self._enabled_ns = t_ns
         words = self._words(t_ns, output)
         self.event(t_ns, f"{words}  [{names}]{': ' if details else ''}{details}")

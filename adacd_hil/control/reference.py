@@ -24,6 +24,7 @@ from adacd_hil.device.arm_watch import EventSource
 from adacd_hil.records import JOINTS, LEARNING, REACTING, ArmState, Event, Reaction, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.contact.reaction import Withdrawal
 from adacd_hil.scheme.supervisor.supervisor import POWERED
+from adacd_hil.settings.arm_settings import OLD_CYCLES
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 
@@ -38,8 +39,6 @@ THROWN_S = 0.15
 THROWN_rad_s = 0.2
 """Excess over the planned speed, away from the contact, from which the arm counts as thrown."""
 
-OLD_CYCLES = 1
-"""Age of the feedback, in cycles, up to which the desired motion continues."""
 LOST_CYCLES = 5
 """After so many cycles of waiting the arm may have moved: the motion restarts from the measured position."""
 

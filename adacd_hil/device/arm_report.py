@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_watch import EventSource
 from adacd_hil.device.canopen_bus import name_error
-from adacd_hil.device.drive import Cia402State, Drive
+from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, Cia402State, Drive
 from adacd_hil.device.torque_sensor import SensorStatus
 from adacd_hil.records import ArmState, Event
 from adacd_hil.settings.arm_settings import DATA_WINDOW_S, SHORTEST_DATA_WINDOW
@@ -254,4 +254,5 @@ def _describe_disabled(drive: Drive) -> list[str]:
     """Return a line with state and mode of a drive that is not enabled; empty for one that is."""
     if drive.is_enabled:
         return []
-    return [f"{drive.name}: {drive.state.name}, mode {drive.mode}, OPERATION_ENABLED in mode 10 expected"]
+    expected = f"OPERATION_ENABLED in mode {MODE_CYCLIC_SYNCHRONOUS_TORQUE} expected"
+    return [f"{drive.name}: {drive.state.name}, mode {drive.mode}, {expected}"]

@@ -23,7 +23,7 @@ class SensorStatus(IntFlag):
     NEGATIVE_OVERLOAD = 4
 
 
-STATUS_BITS = 0x07
+STATUS_BITS = sum(SensorStatus)
 _STATUSES = tuple(SensorStatus(bits) for bits in range(STATUS_BITS + 1))
 USABLE = tuple(status for status in _STATUSES if not status & SensorStatus.NOT_VALID)
 """Statuses with which a torque may be used; an overloaded one is a bound."""

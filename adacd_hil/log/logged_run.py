@@ -6,8 +6,9 @@ Torques in Nm, joint arrays (2,), histories time-first (n, 2).
 begins with the first cycle's number less all whole rounds of the counter. The host counts on.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -158,6 +159,47 @@ def last_armed(cycle: Cycles, state: NDArray[np.uint8], before: int = -1) -> Cyc
 def is_interrupted(state: NDArray[np.uint8]) -> Mask:
     """Return for each cycle (n,) whether its state is REACT or STOPPED."""
     return np.isin(state, REACTING)
+
+
+_KINDS: Final = {
+    SchemeState.ADAPT: "adaptation",
+    SchemeState.CERTIFY: "adaptation",
+    SchemeState.MONITOR: "detection",
+    SchemeState.PAYLOAD: "payload",
+    SchemeState.FAULT: "fault",
+}
+
+
+class SectionRows(NamedTuple):
+    """A section among the states of a run: its kind, its first row, and the next section's, or the run's last row.
+
+    is_complete: False if the run ended, or failed, in it.
+    """
+
+    kind: str
+    first: int
+    end: int
+    is_complete: bool
+
+
+def sections_in(state: NDArray[np.uint8]) -> Iterator[SectionRows]:
+    """Yield the sections among the states (n,) of cycles, or of changes of state, in the order of time.
+
+    A section is a stay in the states of one kind: adaptation (ADAPT, CERTIFY), detection (MONITOR), payload or fault.
+    INIT, COMMISSION and ENABLE belong to no section. REACT and STOPPED belong to the section that they interrupt, to a
+    detection if that is before the first state.
+    """
+    if not state.size:
+        return
+    own = np.maximum.accumulate(np.where(is_interrupted(state), -1, np.arange(state.size)))
+    origins = np.where(own < 0, np.uint8(SchemeState.MONITOR), state[np.maximum(own, 0)])
+    kinds = np.array([_KINDS.get(value, "") for value in SchemeState])[origins]
+    starts = (np.flatnonzero(kinds[1:] != kinds[:-1]) + 1).tolist()
+    for first, end in pairwise((0, *starts, state.size)):
+        kind, following = str(kinds[first]), "" if end == state.size else str(kinds[end])
+        is_complete = following == "detection" if kind == "adaptation" else following not in ("", "fault")
+        if kind:
+            yield SectionRows(kind, first, min(end, state.size - 1), is_complete)
 
 
 def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:

@@ -27,7 +27,7 @@ from adacd_hil.log.logged_run import Milestones, Mismatch, Progress, is_armed_in
 from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.printable import number_of
-from adacd_hil.records import ArmBatch, Event, Request, SchemeState
+from adacd_hil.records import MOTION_START, ArmBatch, Event, Request
 from adacd_hil.replay.can_recording import RecordingAlone
 from adacd_hil.replay.log_source import SAID, CycleStretch, LogSource, Part
 from adacd_hil.replay.replayed_outcome import OutcomeGatherer, Replay
@@ -425,7 +425,7 @@ def _result(
         mismatch_count=0 if comparison is None else comparison.count,
         mismatched_fields={} if comparison is None else dict(comparison.fields),
         tolerance=tolerance,
-        zero_ns=next((each.t_ns for each in gatherer.transitions if each.state is SchemeState.ADAPT), 0),
+        zero_ns=next((each.t_ns for each in gatherer.transitions if each.state is MOTION_START), 0),
         ending=gatherer.transitions[-1] if gatherer.transitions else None,
         threshold_Nm=threshold_Nm,
         push_Nm=push_Nm,

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.logged_run import Mismatch, begins_alarm, host_span, is_armed_in, last_armed
-from adacd_hil.records import JOINTS, LEARNING, PARAMETER_UNITS, FaultReason, SchemeState
+from adacd_hil.log.logged_run import Mismatch, begins_alarm, host_span, is_armed_in, last_armed, sections_in
+from adacd_hil.records import JOINTS, PARAMETER_UNITS, FaultReason, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.score.emulator_truth import HostCycles, KnownTruth, placed_contacts
@@ -53,7 +53,6 @@ class OutcomeGatherer:
 
     def __init__(self, settings: Settings, truth: KnownTruth | None) -> None:
         self.transitions: list[StateChange] = []
-        self.adaptations: list[tuple[int, float | None]] = []  # beginning, ns; duration, s, None: never in MONITOR
         self.theta_hat: tuple[float, ...] = ()
         self._settings = settings
         self._truth = truth
@@ -71,7 +70,6 @@ class OutcomeGatherer:
         self._bank = (slices["tau_ext_bank"], slices["threshold_bank"]) if "threshold_bank" in slices else None
         self._push = PushGatherer(settings) if self._bank else None
         self._thresholds = tuple(Distribution() for _ in range(JOINTS))
-        self._began_ns: int | None = None  # of the adaptation in progress
         self._crossings: list[int] = []  # times at which some joint crosses its threshold
         self._was_over = False
 
@@ -103,7 +101,7 @@ class OutcomeGatherer:
             if follows_gap:
                 self.behind_gap_ns.add(int(ticks.t_ns[row]))
         for row in np.flatnonzero(batch.state != batch.previous_state).tolist():
-            self._enter(
+            self.transitions.append(
                 StateChange(
                     int(ticks.cycle[row]),
                     int(ticks.t_ns[row]),
@@ -153,26 +151,15 @@ class OutcomeGatherer:
         threshold, push = (tuple(joint["p50"] for joint in each) for each in (pushes.threshold_Nm, pushes.push_Nm))
         return threshold, push
 
-    def _enter(self, transition: StateChange) -> None:
-        """Record a change of state, and the beginning or end of an adaptation by it.
-
-        An adaptation begins with ADAPT and ends in MONITOR; FAULT or PAYLOAD end it as one that never reached MONITOR.
-        """
-        self.transitions.append(transition)
-        state = transition.state
-        if state is SchemeState.ADAPT and self._began_ns is None:
-            self._began_ns = transition.t_ns
-        elif state is SchemeState.MONITOR and transition.previous in LEARNING and self._began_ns is not None:
-            self.adaptations.append((self._began_ns, (transition.t_ns - self._began_ns) * 1e-9))
-            self._began_ns = None
-        elif state in (SchemeState.FAULT, SchemeState.PAYLOAD):
-            self._give_up()
-
-    def _give_up(self) -> None:
-        """Record an adaptation in progress, if there is one, as one that never reached MONITOR."""
-        if self._began_ns is not None:
-            self.adaptations.append((self._began_ns, None))
-            self._began_ns = None
+    @property
+    def adaptations(self) -> list[tuple[int, float | None]]:
+        """Beginning, ns, and duration, s, of each adaptation so far; None: it never got to MONITOR."""
+        t_ns = [change.t_ns for change in self.transitions]
+        return [
+            (t_ns[rows.first], (t_ns[rows.end] - t_ns[rows.first]) * 1e-9 if rows.is_complete else None)
+            for rows in sections_in(np.array([change.state for change in self.transitions], np.uint8))
+            if rows.kind == "adaptation"
+        ]
 
     def begin_attempt(self, attempt: int, cycle: int) -> None:
         """End the attempt in progress and begin another.
@@ -187,11 +174,10 @@ class OutcomeGatherer:
         self._was_over = False
 
     def end_attempt(self) -> None:
-        """Record an unfinished adaptation, and place the true contacts of the attempt on the host's clock.
+        """Place the true contacts of the attempt on the host's clock.
 
         Call it at the end of the log, too, before `score`.
         """
-        self._give_up()
         if self._kept:
             host = HostCycles(*map(np.concatenate, zip(*self._kept, strict=True)))
             self._placed += placed_contacts(self._contacts, host, self._settings)

@@ -291,12 +291,10 @@ def placed_contacts(contacts: Sequence[TrueContact], host: HostCycles, settings:
     instants = [(contact.onset, contact.end) for contact in contacts]
     since_ns = np.rint(np.interp(instants, host.cycle, host.t_ns - host.t_ns[0])).astype(np.int64)
     rows = np.searchsorted(host.cycle, [contact.onset for contact in contacts]).tolist()
-    is_certified = settings.scheme == "certified"
-    a_rad_s = settings.certified.cutoffs_rad_s[0] if is_certified else settings.filter.a_rad_s
     times_ns = (since_ns + host.t_ns[0]).tolist()
     host = host._replace(before=np.concatenate(([SchemeState.INIT], host.before[1:])))
     return [
-        placed_contact(contact, (onset_ns, end_ns), host, row, settings, a_rad_s)
+        placed_contact(contact, (onset_ns, end_ns), host, row, settings, settings.cutoff_rad_s)
         for contact, row, (onset_ns, end_ns) in zip(contacts, rows, times_ns, strict=True)
     ]
 

@@ -230,6 +230,8 @@ SHORTEST_DATA_WINDOW = 0.2
 """Smallest part of that time that is judged when the attempt ends in it."""
 
 
+OLD_CYCLES = 1
+"""Age up to which a value counts as fresh."""
 MOST_BLIND_CYCLES = 5
 """Cycles without data in which an arm may go on: half a degree at 100 deg/s and 1 ms. On a real arm no setting allows
 more; on an emulated one the gate lets the torque fade beyond, whatever `data.blind_cycles` says."""

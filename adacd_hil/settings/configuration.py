@@ -31,6 +31,7 @@ from adacd_hil.settings.run_settings import (
 from adacd_hil.settings.schema import ConfigError, setting
 from adacd_hil.settings.scheme_settings import (
     CROSS_TALK,
+    KIND_S,
     CertifiedSettings,
     DetectorSettings,
     EstimatorSettings,
@@ -82,6 +83,16 @@ class Settings:
         Those of `safety.commission_s`, at least one. A cycle with incomplete data that passes doesn't end the row.
         """
         return max(1, round(self.safety.commission_s / self.bus.period_s))
+
+    @property
+    def cutoff_rad_s(self) -> float:
+        """Cut-off of the filter of `tau_ext_hat`, rad/s: the slowest of the certified scheme's bank, or the paper's."""
+        return self.certified.cutoffs_rad_s[0] if self.scheme == "certified" else self.filter.a_rad_s
+
+    @property
+    def report_s(self) -> float:
+        """Time from the detection of a contact to its final report, s."""
+        return KIND_S if self.scheme == "certified" else self.detector.isolation_window_s
 
     @property
     def further_names(self) -> tuple[str, ...]:

@@ -21,8 +21,8 @@ import numpy as np
 from adacd_hil.settings.schema import ConfigError, setting
 from firmware_sim.arm.arms import EmulatedArm, pack_fields
 from firmware_sim.arm.joint_forces import MECHANICS_NUMBERS, REFERENCE_C
-from firmware_sim.arm.plant import ARM_NUMBERS, MECHANICAL_STATE, fit_payload, mass_matrix
-from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM
+from firmware_sim.arm.plant import ARM_NUMBERS, CURRENT_LOOP_HZ, MECHANICAL_STATE, fit_payload, mass_matrix
+from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM, VELOCITY_LOOP_HZ
 from firmware_sim.arm.touch_settings import TICK_S
 
 STANDARD_GRAVITY_M_S2: Final = 9.80665
@@ -65,7 +65,11 @@ class MechanicsSettings:
         _ZERO, low=0.0, high=0.9, meaning="growth of Coulomb friction per torque through the joint"
     )
     viscous_drop_per_K: Pair = setting(
-        _ZERO, unit="1/K", low=0.0, high=0.5, meaning="viscous friction falls by this share per kelvin above 25 °C"
+        _ZERO,
+        unit="1/K",
+        low=0.0,
+        high=0.5,
+        meaning=f"viscous friction falls by this share per kelvin above {REFERENCE_C:g} °C",
     )
     coulomb_drop_per_K: Pair = setting(
         _ZERO, unit="1/K", low=0.0, high=0.5, meaning="Coulomb and static friction likewise"
@@ -272,10 +276,6 @@ class MechanicsSettings:
         return min(max(1, math.ceil(needed)), LARGEST_SUBSTEPS)
 
 
-CURRENT_LOOP_HZ = 1000.0
-VELOCITY_LOOP_HZ = 200.0
-
-
 @dataclass(frozen=True)
 class HabitSettings:
     """Behaviour of a drive that CiA 402 leaves open, or that deviates from the standard."""
@@ -388,7 +388,11 @@ class SensorSettings:
     )
     gain_error: Pair = setting(_ZERO, low=-0.9, high=1.0, meaning="relative error of the torque sensor's sensitivity")
     gain_drift_1_K: Pair = setting(
-        _ZERO, unit="1/K", low=-0.01, high=0.01, meaning="its drift with the joint's temperature, from 25 °C"
+        _ZERO,
+        unit="1/K",
+        low=-0.01,
+        high=0.01,
+        meaning=f"its drift with the joint's temperature, from {REFERENCE_C:g} °C",
     )
     cross_talk: Pair = setting(
         _ZERO, low=-0.5, high=0.5, meaning="share of the other joint's torque that this joint's sensor sees"

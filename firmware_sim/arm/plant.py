@@ -32,7 +32,8 @@ from adacd_hil.compiled import compiled
 from adacd_hil.structured import Structured, float_fields
 from firmware_sim.arm.touch_settings import PAIR, contact_force, contact_torque
 
-CURRENT_LOOP_RAD_S: Final = 2.0 * math.pi * 1000.0
+CURRENT_LOOP_HZ: Final = 1000.0
+CURRENT_LOOP_RAD_S: Final = 2.0 * math.pi * CURRENT_LOOP_HZ
 """Bandwidth of the drive's torque loop; 1 kHz is usual for servo drives."""
 
 ARM_NUMBERS: Final = float_fields(

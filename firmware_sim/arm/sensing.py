@@ -21,7 +21,8 @@ ENCODER_COUNTS: Final = 1 << 20
 """Per revolution, 0x608F."""
 POSITION_LSB_RAD: Final = 2.0 * math.pi / ENCODER_COUNTS
 VELOCITY_LSB_RAD_S: Final = 5e-4
-TRACKING_RAD_S: Final = 2.0 * math.pi * 200.0
+VELOCITY_LOOP_HZ: Final = 200.0
+TRACKING_RAD_S: Final = 2.0 * math.pi * VELOCITY_LOOP_HZ
 TORQUE_NOISE_NM: Final = 0.02
 TORQUE_RANGE_NM: Final = 50.0
 TORQUE_LSB_NM: Final = 2.0 * TORQUE_RANGE_NM / (1 << 16)

@@ -20,11 +20,11 @@ from adacd_hil.records import JOINTS, Vector
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 from adacd_hil.wire.time_marks import ANSWERS, answers_to_sync
+from firmware_sim.arm.joint_forces import REFERENCE_C
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S, DriveMode, Measurement
 from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.canopen.object_dictionary import EmulatedContract
 from firmware_sim.nodes.device import RESET_COMMUNICATION, RESET_NODE
-from firmware_sim.nodes.sensor_node import ROOM_TEMPERATURE_C
 from firmware_sim.scenario.scenario import Scenario
 
 RESETS: Final = (bytes([RESET_NODE]), bytes([RESET_COMMUNICATION]))
@@ -139,7 +139,7 @@ class RecordedBody:
     has_ideal_motors = True
     is_torque_limited = (False, False)
     motor_error_code = (0, 0)
-    joint_temperature_C = (ROOM_TEMPERATURE_C, ROOM_TEMPERATURE_C)
+    joint_temperature_C = (REFERENCE_C, REFERENCE_C)
 
     def __init__(self, codec: Codec) -> None:
         self.motor_torque_Nm = (0.0, 0.0)

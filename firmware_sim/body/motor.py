@@ -28,7 +28,8 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.structured import float_fields
 from firmware_sim.arm.arms import pack_fields
-from firmware_sim.arm.hardware_settings import CURRENT_LOOP_HZ, DriveSettings
+from firmware_sim.arm.hardware_settings import DriveSettings
+from firmware_sim.arm.plant import CURRENT_LOOP_HZ
 from firmware_sim.arm.touch_settings import PAIR, TICK_S
 
 CONTINUOUS_OVER_CURRENT: Final = 0x2310

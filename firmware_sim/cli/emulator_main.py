@@ -40,7 +40,7 @@ from firmware_sim.canopen.object_dictionary import CONTRACTS, EmulatedContract
 from firmware_sim.canopen.pdo_record import LAST_NODE
 from firmware_sim.cli.own_devices import rehearse
 from firmware_sim.cli.scenario_list import check, describe_all
-from firmware_sim.cli.service import Service, StopRequest, open_devices_end
+from firmware_sim.cli.service import SILENCE_NS, Service, StopRequest, open_devices_end
 from firmware_sim.scenario.scenario import Scenario, load_scenario, load_truth, truth_names
 
 _ENDED = "ended by SIGINT, SIGTERM, SIGHUP or --once"
@@ -332,7 +332,7 @@ def _serve(service: Service) -> None:
     print("ready", file=sys.stderr, flush=True)
     service.run()
     if service.is_host_lost:
-        _complain("the host was silent for 2 s, with the drives in Operational")
+        _complain(f"the host was silent for {1e-9 * SILENCE_NS:g} s, with the drives in Operational")
 
 
 def _make_folder(path: Path) -> None:

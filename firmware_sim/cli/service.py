@@ -13,7 +13,7 @@ from firmware_sim.canopen.pdo_record import LISTENED_IDS
 
 _IDLE_NS = 10_000_000  # without SYNC for this long, timers go by the clock: heartbeats before and between runs
 _LONGEST_WAIT_NS = 50_000_000  # how soon a signal is noticed on a silent bus
-_SILENCE_NS = 2_000_000_000  # a host that is silent for this long has gone
+SILENCE_NS = 2_000_000_000  # a host that is silent for this long has gone
 
 
 class StopRequest:
@@ -43,7 +43,7 @@ class Service:
         """`departure`: where the bench puts its frames.
 
         `is_once`: end also when all nodes have been Operational and then neither drive is, for whatever cause, or when
-        the host is silent for `_SILENCE_NS`.
+        the host is silent for `SILENCE_NS`.
         """
         self._bench = bench
         self._bus = bus
@@ -57,7 +57,7 @@ class Service:
         self._heard_ns = 0  # last frame
         self._gone_ns = NEVER_NS  # when the host was found to have gone
         self.is_host_lost = False
-        """Whether a host was silent for `_SILENCE_NS` while a drive was Operational."""
+        """Whether a host was silent for `SILENCE_NS` while a drive was Operational."""
 
     def boot(self) -> None:
         """Drop frames that wait on the bus, power the bench on, and send the boot-up messages.
@@ -127,10 +127,10 @@ class Service:
     def _pass_time(self, now_ns: int, is_idle: bool) -> None:
         """Pass time to the bench: by wall clock if no frame came (`is_idle`), by SYNC if no SYNC came for `_IDLE_NS`.
 
-        A host in lockstep sends the time itself. After a silence of `_SILENCE_NS` the bench outlives the host, and
+        A host in lockstep sends the time itself. After a silence of `SILENCE_NS` the bench outlives the host, and
         lockstep ends.
         """
-        is_silent = now_ns - self._heard_ns > _SILENCE_NS
+        is_silent = now_ns - self._heard_ns > SILENCE_NS
         if is_silent:
             self.is_host_lost = self.is_host_lost or not self._is_left
             self._bench.outlive_host()
@@ -147,7 +147,7 @@ class Service:
             self._time_ns = now_ns
 
     def _is_host_gone(self) -> bool:
-        is_silent = self._clock.now_ns() - self._heard_ns > _SILENCE_NS
+        is_silent = self._clock.now_ns() - self._heard_ns > SILENCE_NS
         return self._has_been_operational and (is_silent or self._is_left)
 
     @property

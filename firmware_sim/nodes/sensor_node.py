@@ -23,8 +23,6 @@ AUTOZERO_SIGNATURE = int.from_bytes(b"zero", "little")
 """The value that 0x6125 accepts."""
 AUTOZERO_SAMPLES = 64
 """Samples whose mean becomes the zero: an eighth of the noise of one."""
-ROOM_TEMPERATURE_C = 25.0
-"""0x2111 of a sensor without the temperature of its joint."""
 
 _EVENTS = frozenset({(0x6150, 1), (0x1001, 0)})
 

@@ -26,8 +26,9 @@ from adacd_hil.settings.configuration_files import ConfigurationLayer, resolved_
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import builtin_names
 from firmware_sim.arm.arms import ARMS
-from firmware_sim.arm.hardware_settings import CURRENT_LOOP_HZ, STANDARD_GRAVITY_M_S2, VELOCITY_LOOP_HZ
-from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM
+from firmware_sim.arm.hardware_settings import STANDARD_GRAVITY_M_S2
+from firmware_sim.arm.plant import CURRENT_LOOP_HZ
+from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM, VELOCITY_LOOP_HZ
 from firmware_sim.scenario.scenario import ArmTruth, TruthArmSettings
 
 Pair = tuple[float, float]
@@ -42,6 +43,8 @@ _RANGE_PER_RATED: Final = 4.0
 _LEAST_RANGE_SHARE: Final = 0.1
 """Part of the rated torque that the frames of a sensor must be able to carry to be played."""
 _HOLDING_SHARE: Final = 1.5
+_CAD_SPARE: Final = 0.02
+"""Share by which links keep clear of an inertia that vanishes in some motion."""
 _HEAVIEST: Final = 10.0
 """Most that payloads are multiplied by: they go up to 1 kg, and a scenario takes 20 kg."""
 
@@ -220,7 +223,7 @@ def _place_links(told: ToldArm, truth: ArmTruth, assumed: list[str]) -> _Links:
         links = _from_cad(told_m, arm.cad_theta)
         assumed.append(
             f"links of {links.mass_kg[0]:.3g} and {links.mass_kg[1]:.3g} kg whose inertia is arm.cad_theta's within "
-            "2 %; --truth with arm.mass_kg plays another"
+            f"{100.0 * _CAD_SPARE:g} %; --truth with arm.mass_kg plays another"
         )
     else:
         links = _rods(told_m, _heavy_enough(told_m, arm.rated_torque_Nm))
@@ -280,8 +283,8 @@ def _heavy_enough(length_m: Pair, rated_Nm: Pair) -> Pair:
 def _from_cad(length_m: Pair, theta: Sequence[float]) -> _Links:
     """Return two links with the inertia of `theta`, which is `arm.cad_theta`.
 
-    With a2² above 0.98 (a1 - a3) a3, a1 is up to 2 % larger, so that the outstretched arm keeps an inertia against each
-    motion. Raises ConfigError if no links can have it.
+    With a2² near (a1 - a3) a3, a1 is larger by up to _CAD_SPARE, so that the outstretched arm keeps an inertia against
+    each motion. Raises ConfigError if no links can have it.
     """
     a1, a2, a3 = theta[:3]
     l1, l2 = length_m
@@ -295,7 +298,7 @@ def _from_cad(length_m: Pair, theta: Sequence[float]) -> _Links:
         m2 = alpha / l1**2 / 2.0
         c2 = 0.0
     else:
-        c2 = min(max(l2 / 2.0, 1.02 * beta * l1 / alpha), 0.98 * gamma * l1 / beta)
+        c2 = min(max(l2 / 2.0, (1.0 + _CAD_SPARE) * beta * l1 / alpha), (1.0 - _CAD_SPARE) * gamma * l1 / beta)
         m2 = beta / (l1 * c2)
     left = max(alpha - m2 * l1**2, 0.0)
     m1 = max(3.0 * left / l1**2, 1e-4)

@@ -151,9 +151,7 @@ class Scenario:
         high=1e6,
         meaning="how long a run of it is meant to take, since the drives were enabled",
     )
-    acknowledge_faults: int = setting(
-        0, low=0, high=1000, meaning="how many faults the person acknowledges, each 1 s after it"
-    )
+    acknowledge_faults: int = setting(0, low=0, high=1000, meaning="how many faults the person acknowledges")
     profile: str = setting("P", choices=tuple(ARMS), meaning="which arm")
     own_arm: EmulatedArm | None = setting(None, meaning="an arm of one's own in place of the profile")
     truth: str = setting("", meaning="name of the truth in that arm, with the digest of a file")

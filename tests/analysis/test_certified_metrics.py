@@ -26,7 +26,17 @@ from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.lab.score.run_arrays import split_sections
 from adacd_hil.lab.score.run_judge import step_delay_s
 from adacd_hil.log.reader import LoggedEvent
-from adacd_hil.records import BEGINS_ANEW, ContactKind, ContactLevel, Event, Location, Reaction, SchemeState
+from adacd_hil.records import (
+    BEGINS_ANEW,
+    ContactKind,
+    ContactLevel,
+    Event,
+    FaultReason,
+    Location,
+    Reaction,
+    SchemeState,
+)
+from adacd_hil.replay.replayed_outcome import OutcomeGatherer, StateChange
 from adacd_hil.score.wording import NONE
 
 
@@ -34,7 +44,7 @@ def test_an_adaptation_lasts_until_its_model_is_certified():
     assert evaluated(make_certified_run()).adaptation_s == pytest.approx({"A": 1.0, "D": 0.5})
 
 
-@pytest.mark.parametrize(
+IN_SECTIONS = pytest.mark.parametrize(
     ("stays", "sections"),
     [
         (
@@ -54,8 +64,28 @@ def test_an_adaptation_lasts_until_its_model_is_certified():
     ],
     ids=["while it learns", "while it parks", "then a payload change", "one that clears", "no contact, a fault"],
 )
+
+
+@IN_SECTIONS
 def test_a_contact_belongs_to_the_section_that_it_interrupts(stays, sections):
     assert [(section.kind, section.is_complete) for section in split_sections(make_run(*stays))] == sections
+
+
+@IN_SECTIONS
+def test_a_replay_has_the_adaptations_of_the_report(stays, sections):
+    run = make_run(*stays)
+    rows = np.flatnonzero(np.diff(run.state, prepend=SchemeState.INIT))
+    before = np.concatenate(([SchemeState.INIT], run.state))
+    gatherer = OutcomeGatherer(run.settings, None)
+    gatherer.transitions += [
+        StateChange(row, int(run.t_ns[row]), SchemeState(before[row]), SchemeState(run.state[row]), FaultReason.NONE)
+        for row in rows.tolist()
+    ]
+    took_s = [
+        each.duration_s if each.is_complete else None for each in split_sections(run) if each.kind == "adaptation"
+    ]
+    assert [duration_s for _, duration_s in gatherer.adaptations] == pytest.approx(took_s)
+    assert sum(is_complete for kind, is_complete in sections if kind == "adaptation") == sum(map(bool, took_s))
 
 
 def test_the_last_test_of_each_adaptation_and_their_number_are_told():

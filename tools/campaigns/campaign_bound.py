@@ -24,7 +24,7 @@ from lab import PERIOD_S, LabArm, Push, Recording, random_moves, record
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from firmware_sim.arm.hardware_settings import VELOCITY_LOOP_HZ
+from firmware_sim.arm.sensing import VELOCITY_LOOP_HZ
 
 FAST_RAD_S = 800.0
 LAG_S = 1.0 / (np.pi * VELOCITY_LOOP_HZ)

@@ -20,7 +20,7 @@ from adacd_hil.log.logged_run import settings_of
 from adacd_hil.log.reader import RunLog, each_once, read_log
 from adacd_hil.log.types.topics import CONTACT, CONTROL, CYCLE, EVENTS, SCHEME
 from adacd_hil.printable import number_of
-from adacd_hil.records import ContactReport, SchemeState, Vector
+from adacd_hil.records import MOTION_START, ContactReport, SchemeState, Vector
 from adacd_hil.remedies import hint
 from adacd_hil.settings.configuration import Settings
 
@@ -183,7 +183,7 @@ def load(run: str | Path) -> LoadedRun:
     left_out = max(len(log.topics[topic]) for topic in _TOPICS) - len(t_ns)
     there = {each.topic for each in read_info(path, is_brief=True).topics}
     lack = f"{number_of(left_out, 'cycle')} without a record of each topic left out" if left_out else ""
-    is_moving = np.flatnonzero(arrays["state"] == SchemeState.ADAPT)
+    is_moving = np.flatnonzero(arrays["state"] == MOTION_START)
     zero_ns = int(t_ns[is_moving[0] if is_moving.size else 0])
     arrays = {"t_s": (t_ns - zero_ns) * 1e-9, **arrays}
     for values in arrays.values():

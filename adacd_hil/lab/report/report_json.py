@@ -9,6 +9,7 @@ from typing import Any, Final
 from adacd_hil.lab.score.metrics import Metrics, ReportSource
 from adacd_hil.lab.score.run_arrays import StretchOfRun
 from adacd_hil.plain_values import plain_values
+from adacd_hil.records import MOTION_START
 
 JSON_NAME: Final = "report.json"
 SCHEMA: Final = 3
@@ -30,7 +31,7 @@ def report_json(
             "schema": SCHEMA,
             "verdict": metrics.verdict,
             "is_clean": metrics.is_clean,
-            "time_zero": "first cycle in ADAPT (motion start)",
+            "time_zero": f"first cycle in {MOTION_START.name} (motion start)",
             "adaptation_s": metrics.adaptation_s,
             "sections": {
                 section.label: {**vars(section), "duration_s": section.duration_s} for section in metrics.sections

@@ -351,7 +351,7 @@ def report_page(metrics: Metrics, run: Run, source: ReportSource) -> str:
         timing=timing_tables(metrics.timing),
         origin=origin_table(metrics, run, source),
         settling_constants=f"{SETTLING_TIME_CONSTANTS:g}",
-        settling_s=f"{SETTLING_TIME_CONSTANTS / run.a_rad_s:g}",
+        settling_s=f"{SETTLING_TIME_CONSTANTS / run.settings.cutoff_rad_s:g}",
         push_within=PUSH_WITHIN,
         motion_start_s=None if since_ns is None else since_ns * 1e-9,
     )

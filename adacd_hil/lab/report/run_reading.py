@@ -62,7 +62,17 @@ from adacd_hil.log.reader import LoggedEvent, LogStream, Series, contacts_of, st
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, FRAME_CHECKS, SCHEME
 from adacd_hil.printable import one_line
-from adacd_hil.records import JOINTS, LEARNING, REACTING, ContactReport, CycleRecord, FaultReason, Request, SchemeState
+from adacd_hil.records import (
+    JOINTS,
+    LEARNING,
+    MOTION_START,
+    REACTING,
+    ContactReport,
+    CycleRecord,
+    FaultReason,
+    Request,
+    SchemeState,
+)
 from adacd_hil.score.emulator_truth import Rows, TruthTable, extreme_rows, foreign_truth, read_truth
 from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
@@ -318,7 +328,7 @@ class RunReading:
         """
         if self._first_ns is None:
             self._first_ns = int(scheme.t_ns[0])
-        adapting = np.flatnonzero(state == SchemeState.ADAPT)
+        adapting = np.flatnonzero(state == MOTION_START)
         if self._zero_ns is None and adapting.size:
             self._zero_ns = int(scheme.t_ns[adapting[0]])
         asked = np.flatnonzero(scheme.records["request"] == Request.FINISH)
@@ -365,7 +375,7 @@ class RunReading:
 
     @property
     def _settling_s(self) -> float:
-        return SETTLING_TIME_CONSTANTS / self._rows.run(self._shell, slice(0)).a_rad_s
+        return SETTLING_TIME_CONSTANTS / self._shell.settings.cutoff_rad_s
 
     def is_settled(self, until_ns: int, last_ns: int) -> bool:
         """Return whether contacts, reactions and adaptations from before `until_ns` are over at the cycle at `last_ns`.
@@ -657,7 +667,7 @@ def _busy(run: Run) -> Iterator[tuple[float, float]]:
 
     A margin before and the settling time after are included.
     """
-    later_s = SETTLING_TIME_CONSTANTS / run.a_rad_s
+    later_s = SETTLING_TIME_CONSTANTS / run.settings.cutoff_rad_s
     for stay in stays_of(run):
         if stay.state in BUSY:
             yield stay.start_s - MARGIN_S, stay.end_s + later_s

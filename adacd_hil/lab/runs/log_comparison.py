@@ -21,7 +21,7 @@ from adacd_hil.log.logged_run import Milestones, Progress, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log, each_once, report_values
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.log.types.topics import CONTACT, CYCLE, SCHEME
-from adacd_hil.records import ContactReport, SchemeState
+from adacd_hil.records import MOTION_START, ContactReport, SchemeState
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.settings.setting_keys import changed_keys
 
@@ -146,7 +146,7 @@ def _motion_start(path: Path) -> tuple[int, int]:
         scheme = piece.series[SCHEME.name]
         if not len(scheme):
             continue
-        rows = np.flatnonzero(scheme.records["state"] == SchemeState.ADAPT)
+        rows = np.flatnonzero(scheme.records["state"] == MOTION_START)
         row = int(rows[0]) if rows.size else 0
         here = int(scheme.records["cycle"][row]), int(scheme.t_ns[row])
         first = first or here

@@ -43,12 +43,11 @@ from adacd_hil.lab.score.run_judge import (
     step_delay_s,
 )
 from adacd_hil.lab.score.verdict import compare_with_paper, list_findings
-from adacd_hil.log.logged_run import Cycles
+from adacd_hil.log.logged_run import Cycles, enters_react
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, SchemeState, Vector
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.score.judge import Detection, Score, TrueContact, judge
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.scheme_settings import KIND_S
 
 
 class RunGatherer:
@@ -220,8 +219,9 @@ def _contact(
     delay_s = reported["detected_s"] - onset_s if reported else math.inf
     # The host sees samples up to the detection for the delay, up to the end of the window for the rest.
     until_alarm = np.abs(tau_ext[since_s <= delay_s]).max(axis=0)
-    is_seen = since_s <= delay_s + _window_s(run)
-    until_final, links = _touches(run, onset_s, onset_s + delay_s + _window_s(run) if reported else float(time_s[-1]))
+    report_s = run.settings.report_s
+    is_seen = since_s <= delay_s + report_s
+    until_final, links = _touches(run, onset_s, onset_s + delay_s + report_s if reported else float(time_s[-1]))
     channels = channels_at(run, onset_s)
     steps_s = [step_delay_s(until_alarm, threshold, a_rad_s, b_rad_s) for a_rad_s, b_rad_s, threshold in channels]
     crossed_s = [delay for delay in steps_s if delay is not None]
@@ -262,11 +262,6 @@ def _touches(run: Run, from_s: float, until_s: float) -> tuple[Vector, Cycles]:
     rows = slice(np.searchsorted(time_s, from_s), np.searchsorted(time_s, until_s, side="right"))
     is_touched = run.truth.contact_index[rows] >= 0.0
     return run.truth.tau_ext[rows][is_touched], run.truth.contact_link[rows][is_touched].astype(np.int64)
-
-
-def _window_s(run: Run) -> float:
-    """Return the time from a detection to the final report of its contact, s, by the run's scheme."""
-    return run.settings.detector.isolation_window_s if run.certified is None else KIND_S
 
 
 def _is_direction_right(direction: tuple[int, int] | None, impulse: Vector) -> bool | None:
@@ -381,10 +376,8 @@ def collect_evidence(columns: CycleColumns, period_us: float) -> TimingEvidence:
 def find_reactions(
     columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8], before: int = SchemeState.INIT
 ) -> NDArray[np.bool_]:
-    """Return for each cycle of `columns` (n,) whether the state becomes REACT in it.
+    """Return for each cycle of `columns` (n,) whether a reaction begins in it.
 
     cycle, state: those of /scheme (k,). before: the state in the cycle before the first.
     """
-    is_reacting = state == SchemeState.REACT
-    begins = is_reacting & ~np.concatenate(([before == SchemeState.REACT], is_reacting[:-1]))
-    return np.isin(columns["cycle"], cycle[begins])
+    return np.isin(columns["cycle"], cycle[enters_react(np.concatenate(([before], state))[:-1], state)])

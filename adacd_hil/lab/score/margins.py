@@ -261,7 +261,7 @@ class UntouchedGatherer:
         to finish on are not free, either. Without a truth, the settling time before and after each detection stands for
         the contact. Call it once per piece, in the order of time: it stores the piece's last cycle in REACT.
         """
-        settling_ns = round(SETTLING_TIME_CONSTANTS / outline.a_rad_s * 1e9)
+        settling_ns = round(SETTLING_TIME_CONSTANTS / outline.settings.cutoff_rad_s * 1e9)
         t_ns, truth, finish = piece.t_ns, outline.truth, outline.finish_cycle
         free = np.ones(t_ns.size, dtype=np.bool_) if finish is None else piece.cycle < finish
         if truth is None:

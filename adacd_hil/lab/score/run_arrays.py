@@ -24,7 +24,7 @@ from adacd_hil.log.logged_run import (
     Truth,
     host_cycles,
     host_span,
-    is_interrupted,
+    sections_in,
 )
 from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.log.time_window import TimeWindow
@@ -262,12 +262,6 @@ class Run:
         """Whether the configuration has a CAD model, `arm.cad_theta`."""
         return len(self.settings.arm.cad_theta) > 0
 
-    @property
-    def a_rad_s(self) -> float:
-        """Cut-off of the filter of `tau_ext_hat`, rad/s: the slowest of the certified scheme's bank, or the paper's."""
-        is_certified = self.certified is not None
-        return self.settings.certified.cutoffs_rad_s[0] if is_certified else self.settings.filter.a_rad_s
-
     def time_s(self) -> Vector:
         """Return the time of each cycle since motion start, s (n,)."""
         # Subtracted as integers: float64 resolves only 256 ns of an absolute time.
@@ -290,29 +284,10 @@ class Section:
         return self.end_s - self.start_s
 
 
-_KINDS: Final = {
-    SchemeState.ADAPT: "adaptation",
-    SchemeState.CERTIFY: "adaptation",
-    SchemeState.MONITOR: "detection",
-    SchemeState.PAYLOAD: "payload",
-    SchemeState.FAULT: "fault",
-}
-
-
 def section_label(index: int) -> str:
     """Return the label of the section with number `index`, from 0: A to Z, then AA, AB and so on."""
     letter = chr(ord("A") + index % 26)
     return letter if index < 26 else section_label(index // 26 - 1) + letter
-
-
-def origins(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the state of each cycle (n,), but for REACT and STOPPED the state that was interrupted.
-
-    MONITOR if that is before the first cycle.
-    """
-    rows = np.arange(state.size)
-    own = np.maximum.accumulate(np.where(is_interrupted(state), -1, rows))
-    return np.where(own < 0, np.uint8(SchemeState.MONITOR), state[np.maximum(own, 0)])
 
 
 class Stay(NamedTuple):
@@ -341,27 +316,12 @@ def stays_of(run: Run) -> list[Stay]:
 
 
 def split_sections(run: Run) -> tuple[Section, ...]:
-    """Return the lettered sections of a run, in the order of time; () for a run without cycles.
-
-    A section is a stay in the states of one kind: adaptation (ADAPT, CERTIFY), detection (MONITOR), payload or fault.
-    Cycles in INIT, COMMISSION and ENABLE belong to no section. REACT and STOPPED belong to the section that they
-    interrupt.
-    """
-    if run.state.size == 0:
-        return ()
-    kinds = np.array([_KINDS.get(SchemeState(value), "") for value in range(len(SchemeState))])[origins(run.state)]
-    starts = np.concatenate(([0], np.flatnonzero(kinds[1:] != kinds[:-1]) + 1))
+    """Return the lettered sections of a run, in the order of time; () for a run without cycles."""
     time_s = run.time_s()
-    sections: list[Section] = []
-    for start, end in zip(starts, [*starts[1:], None], strict=True):
-        kind = str(kinds[start])
-        if not kind:
-            continue
-        end_s = float(time_s[-1] if end is None else time_s[end])
-        following = "" if end is None else str(kinds[end])
-        is_complete = following == "detection" if kind == "adaptation" else following not in ("", "fault")
-        sections.append(Section(section_label(len(sections)), kind, float(time_s[start]), end_s, is_complete))
-    return tuple(sections)
+    return tuple(
+        Section(section_label(number), rows.kind, float(time_s[rows.first]), float(time_s[rows.end]), rows.is_complete)
+        for number, rows in enumerate(sections_in(run.state))
+    )
 
 
 def section_at(sections: Iterable[Section], time_s: float) -> str | None:

@@ -57,7 +57,7 @@ def timed_contacts(run: Run) -> tuple[TrueContact, ...]:
 
 def contacts_of(run: Run) -> tuple[TrueContact, ...]:
     """Return the true contacts of a run, with the times in which they explain alarms of its own scheme."""
-    return placed_in(run, timed_contacts(run), run.state, run.threshold, run.a_rad_s)
+    return placed_in(run, timed_contacts(run), run.state, run.threshold, run.settings.cutoff_rad_s)
 
 
 def placed_in(
@@ -120,6 +120,6 @@ def channels_at(run: Run, time_s: float) -> list[tuple[float, float | None, Vect
     """
     row = row_at(run, time_s)
     if run.certified is None:
-        return [(run.a_rad_s, None, threshold_in_force(run.threshold[row], run.settings))]
+        return [(run.settings.cutoff_rad_s, None, threshold_in_force(run.threshold[row], run.settings))]
     thresholds = run.certified.threshold[row]
     return [(*cutoffs, threshold) for cutoffs, threshold in zip(channels_of(run.settings), thresholds, strict=True)]

@@ -23,7 +23,6 @@ from adacd_hil.records import JOINTS, ContactLevel, Reaction, SchemeState, Vecto
 from adacd_hil.scheme.supervisor.findings import COLLISION, CONTACT_SHIFT
 from adacd_hil.scheme.supervisor.supervisor import IS_REACTING, SupervisorMemory
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.scheme_settings import KIND_S
 from adacd_hil.structured import PerJoint
 
 TURNED_CYCLES = 5
@@ -87,7 +86,6 @@ def fill_constants(settings: Settings, k: CourseConstants) -> None:
     In the paper's scheme the reaction to each contact is WITHDRAW.
     """
     wish, is_paper = settings.reaction, settings.scheme == "paper"
-    window_s = settings.detector.isolation_window_s
     chosen = (("withdraw",) * JOINTS,) * len(ContactLevel) if is_paper else (wish.contact, wish.collision)
     k.reactions[:] = [[Reaction[name.upper()] for name in names] for names in chosen]
     k.two_sided = Reaction[wish.two_sided.upper()]
@@ -95,7 +93,7 @@ def fill_constants(settings: Settings, k: CourseConstants) -> None:
     k.blind_cycles = _NEVER if is_paper else round(BLIND_S / settings.bus.period_s)
     k.due_cycles[:] = [
         round(due_s / settings.bus.period_s)
-        for due_s in ((0.0, window_s, window_s) if is_paper else (0.0, LINK_S, KIND_S))
+        for due_s in (0.0, settings.report_s if is_paper else LINK_S, settings.report_s)
     ]
     k.collision_Nm[:] = settings.detector.collision_Nm
 

@@ -45,6 +45,7 @@ from adacd_hil.scheme.supervisor.findings import (
     WITHHELD,
 )
 from adacd_hil.scheme.supervisor.transitions import SchemeEvent, leads_on, next_state
+from adacd_hil.settings.arm_settings import OLD_CYCLES
 from adacd_hil.settings.configuration import Settings
 
 REST_HOLD_S = 0.05
@@ -212,7 +213,7 @@ def _count(m: SupervisorMemory, arm: Sample, observation: int) -> None:
     m.moving_cycles = 0 if observation & AT_REST else m.moving_cycles + 1
     m.cleared_cycles = 0 if observation & ANY_CONTACT else m.cleared_cycles + 1
     m.blind_cycles = m.blind_cycles + 1 if observation & UNSEEN else 0
-    m.stale_cycles = m.stale_cycles + 1 if arm.age > 1 else 0
+    m.stale_cycles = m.stale_cycles + 1 if arm.age > OLD_CYCLES else 0
 
 
 @compiled
