@@ -58,6 +58,7 @@ _ROUNDING = ("avx2", "fma")
 _NUMBER = re.compile(r"\d+\.?\d*")
 _TOPICS = ("/scheme", "/control", "/contact")
 _DIGEST_BYTES = 4
+_PARTS = "\n[log]\npart_min = 0.05\n"
 
 
 def names() -> list[str]:
@@ -109,12 +110,16 @@ def play(name: str, folder: Path, cycles: int = 0) -> RunLog:
 
 
 def play_on_vcan(name: str, folder: Path) -> Played:
-    """Play a reference run with an arm of the emulator's by the commands, on vcan0; a known arm's files are copied."""
+    """Play a reference run with an arm of the emulator's by the commands, on vcan0, and log it in parts of 3 s.
+
+    A known arm's files are copied.
+    """
     known = [shutil.copy(path, folder) for path in known_arm(name) if path.exists()]
     options = [word for option, path in zip(("--tare", "--history"), known, strict=False) for word in (option, path)]
     with emulator(folder, "--scenario", str(RUNS / f"{name}.scenario.toml")):
-        config = ("--config", str(RUNS / f"{name}.config.toml"))
-        return run_on_vcan(folder, "--clock", "lockstep", *config, *options)
+        config = folder / f"{name}.config.toml"
+        config.write_text((RUNS / config.name).read_text(encoding="utf-8") + _PARTS, encoding="utf-8")
+        return run_on_vcan(folder, "--clock", "lockstep", "--config", str(config), *options)
 
 
 def _files(name: str, settings: Settings) -> list[UsedTare | UsedHistory]:

@@ -13,6 +13,7 @@ from reference_runs import (
 )
 
 from adacd_hil.control.history_file import read_history
+from adacd_hil.log.log_parts import parts_of
 from adacd_hil.log.reader import read_log
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow]
@@ -29,6 +30,7 @@ def test_the_commands_come_to_the_stored_decisions_and_bits(played: Played) -> N
     """To the bits where the numbers are computed as they were stored."""
     stored, now = Reference.stored(NAME), Reference.of(read_log(played.log))
     assert (played.status, played.error_lines) == (0, [])
+    assert len(parts_of(played.log)) == 3
     is_same = stored.arithmetic == now.arithmetic
     assert decision_differences(stored, now, *((0, 0.0) if is_same else (CYCLES, SHARE))) == []
     assert (bit_differences(stored, now) if is_same else []) == []

@@ -5,8 +5,8 @@
     python tools/campaigns/reached_lines.py paper-quick lose-feedback     these runs alone
 
 Plays each run of `tests/reference` and five scenarios of the emulator without compilation, the log's writer included,
-and replays each log. The run of a known arm comes once more by the commands, on vcan; the stored log is replayed as it
-is, as frames that another program recorded, and with another setting. A line counts once it was executed; importing a
+and replays each log. The run of a known arm comes once more by the commands, on vcan, and its frames are decoded; the
+stored log is replayed in each way of `stored_log`. A line counts once it was executed; importing a
 module reaches the lines that define its functions, so the share of lines within functions is told apart. Neither the
 emulator nor what a run and its replay do without (`LEFT_OUT`) counts.
 
@@ -36,12 +36,11 @@ from adacd_hil.log.log_files import LOG_NAME
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "reference")]
 
-import can  # noqa: E402
 import reference_runs  # noqa: E402 (it is the tests')
+import stored_log  # noqa: E402 (so is this)
 
 COVERAGE = "coverage==7.17.5"
 FAULTS = ("corrupt-torque", "drive-fault-and-recovery", "lose-feedback", "power-loss-and-return", "stuck-torque")
-STORED_LOG = ROOT / "tests" / "reference" / "logs" / "recovery.mcap"
 KNOWN = "certified-known"
 LEFT_OUT = ("adacd_hil/lab/", "adacd_hil/api.py", "adacd_hil/cli/completion.py")
 _MOST_FILES = 25
@@ -103,37 +102,31 @@ def play(name: str, folder: Path) -> Path:
     return folder / LOG_NAME
 
 
-def replay(log: Path, *options: str) -> None:
+def replay(log: object, *options: object) -> None:
     """Replay a log by the command; it ends this process unless the decisions are the same."""
     from adacd_hil.cli.main import main as host
 
-    sys.argv = ["adacd-hil", "replay", str(log), *options]
+    sys.argv = ["adacd-hil", "replay", *map(str, (log, *options))]
     host()
 
 
 def play_by_commands(folder: Path) -> None:
-    """Play the run of a known arm by the commands, on vcan, and replay it."""
+    """Play the run of a known arm by the commands, on vcan, and replay it by its frames."""
     call = f"play_on_vcan({KNOWN!r}, Path({os.fspath(folder)!r}))"
     program = f"import sys; from reference_runs import Path, play_on_vcan; sys.exit({call}.status)"
     command = [ROOT / "tools" / "with-vcan", "--can", "vcan0", "--", sys.executable, "-c", program]
     subprocess.run(command, check=True)
-    replay(folder / LOG_NAME)
+    replay(folder / LOG_NAME, "--frames")
 
 
-def replay_recording(folder: Path) -> None:
-    """Replay frames that another program recorded, against the log of their run."""
-    recording = folder / "bus.log"
-    with can.LogReader(STORED_LOG) as reader, can.Logger(recording) as converted:
-        for message in reader:
-            converted(message)
-    replay(recording, "--against", str(STORED_LOG))
+def replay_stored(way: str, folder: Path) -> None:
+    """Replay the stored log in a way of `stored_log`."""
+    replay(*stored_log.WAYS[way](folder))
 
 
 OTHER_WAYS = {
     f"{KNOWN} on vcan": play_by_commands,
-    "stored log": lambda _: replay(STORED_LOG),
-    "stored log as a recording": replay_recording,
-    "stored log, another setting": lambda _: replay(STORED_LOG, "--set", "certified.noise_sigmas=13"),
+    **{f"stored log, {way}": partial(replay_stored, way) for way in stored_log.WAYS},
 }
 """The references that are no run on the embedded bus, by name."""
 
