@@ -27,6 +27,7 @@ from adacd_hil.records import SchemeState
 from adacd_hil.replay.log_source import LogSource
 from adacd_hil.replay.replay import replay_source
 from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.settings.run_settings import REACTIONS
 
 RENEW = "if this is meant: python tests/reference/renew.py"
 UNCOMPILED = {"certified-quick": 1000, "paper-quick": 750}
@@ -99,7 +100,7 @@ def test_uncompiled_code_comes_to_the_same_bits(name: str, tmp_path: Path) -> No
 
 def test_the_runs_cover_both_schemes_and_every_contract() -> None:
     settings = [load_settings(str(RUNS / f"{name}.config.toml")) for name in names()]
-    assert len(settings) >= 18
+    assert len(settings) >= 21
     assert {(one.scheme, one.devices.contract) for one in settings} == {
         ("paper", "arm"),
         ("paper", "arm_fd_500us"),
@@ -121,6 +122,12 @@ def test_the_runs_cover_a_host_that_follows_a_pipelined_one_gears_and_gravity() 
         device.settings.scale.gear_ratio for one in settings for device in place_devices(one) if device.joint == 0
     }
     assert ratios >= {1.0, 50.0}
+
+
+def test_the_runs_take_every_reaction() -> None:
+    wishes = [load_settings(str(RUNS / f"{name}.config.toml")).reaction for name in names()]
+    assert {name for wish in wishes for name in wish.contact + wish.collision} == set(REACTIONS) - {"none"}
+    assert {wish.start for wish in wishes} == {"desired", "measured"}
 
 
 def test_the_runs_come_through_every_state() -> None:
