@@ -93,6 +93,7 @@ def test_what_a_newcomer_can_not_type_is_a_complaint(text: str, said: str, tmp_p
     ("text", "status", "said", "is_good"),
     [
         ("doctor", 1, "ok       load\n\x1b[31mFAILED\x1b[0m   rate   SYNC 594/s of 1000\n", True),
+        ("doctor", 1, "FAILED   rate   SYNC 594/s\nFAILED   rate: see `commtest`\n", True),
         ("doctor", 1, "FAILED   rate   SYNC 594/s\nFAILED   nodes   Drive2 is silent\n", False),
         ("commtest", 1, "not sufficient: 8 % of the periods\n", True),
         ("commtest", 5, "not sufficient: 8 % of the periods\n", False),

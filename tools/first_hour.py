@@ -72,7 +72,7 @@ MOST_LINES = 4500
 BUS = "can0"
 HANG_S = 900.0
 """Longest that a command may take."""
-FAILED, OF_THIS_MACHINE = r"FAILED|not sufficient: ", r"FAILED +(rate$|rate |SYNC )|not sufficient: "
+FAILED, OF_THIS_MACHINE = r"FAILED|not sufficient: ", r"FAILED +(rate\b|SYNC )|not sufficient: "
 """What `doctor` and `commtest` say of what failed, and of a host that isn't on time: a guest of user-mode Linux."""
 MEANT = {r"--truth wrong-sign": 4}
 """Exit statuses that a command is meant to have in place of 0: the arm is not what the host was told."""
