@@ -125,9 +125,16 @@ def test_the_runs_cover_a_host_that_follows_a_pipelined_one_gears_and_gravity() 
 
 
 def test_the_runs_take_every_reaction() -> None:
-    wishes = [load_settings(str(RUNS / f"{name}.config.toml")).reaction for name in names()]
-    assert {name for wish in wishes for name in wish.contact + wish.collision} == set(REACTIONS) - {"none"}
-    assert {wish.start for wish in wishes} == {"desired", "measured"}
+    """By the level and the link of the contacts that are stored."""
+    wishes = {name: load_settings(str(RUNS / f"{name}.config.toml")).reaction for name in names()}
+    taken = {
+        (wish.collision if contact["level"] == "COLLISION" else wish.contact)[contact["link"] - 1]
+        for name, wish in wishes.items()
+        for contact in Reference.stored(name).decisions["contacts"]
+        if contact["link"] > 0
+    }
+    assert taken == set(REACTIONS) - {"none"}
+    assert {wish.start for wish in wishes.values()} == {"desired", "measured"}
 
 
 def test_the_runs_come_through_every_state() -> None:
